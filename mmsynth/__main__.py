@@ -1,0 +1,5 @@
+"""``python -m mmsynth``."""
+
+from mmsynth.cli import main
+
+main()

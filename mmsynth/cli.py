@@ -1,0 +1,287 @@
+"""The command line: each command parses, calls one public function, and prints."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mmsynth.errors import InputError
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Learn one radiance field of a scene from several sensors; then convert, generate, mesh.",
+)
+RunOption = Annotated[Path | None, typer.Option("--run", help="run folder; default: the last fit made in this folder")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object on stdout and nothing else there")]
+SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="scene folder, or `example` for the packaged scene")]
+
+
+def command(name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register a command whose ``InputError`` becomes one sentence on stderr and exit code 2."""
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        @app.command(name)
+        @functools.wraps(function)
+        def guarded(*args: Any, **kwargs: Any) -> None:
+            try:
+                function(*args, **kwargs)
+            except InputError as error:
+                print(f"error: {error}", file=sys.stderr)
+                raise typer.Exit(2) from None
+            except KeyboardInterrupt:
+                print("interrupted", file=sys.stderr)
+                raise typer.Exit(130) from None
+
+        return guarded
+
+    return register
+
+
+def _names(text: str | None) -> list[str] | None:
+    from mmsynth.scene.scene import canonical_modality
+
+    return None if text is None else [canonical_modality(n) for n in text.split(",") if n.strip()]
+
+
+def _views(text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    if not re.fullmatch(r"\d+(,\d+)*", text):
+        raise InputError(f"--views {text!r}: expected view ids such as 9,19.")
+    return tuple(int(v) for v in text.split(","))
+
+
+def _seconds(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|h)?", text.strip())
+    if not match or float(match[1]) <= 0:
+        raise InputError(f"--budget {text!r}: expected a time such as 60s, 5m or 1h.")
+    return float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2] or "s"]
+
+
+def _scene_path(text: str) -> Path:
+    from mmsynth.data import data_folder
+
+    path = Path(text)
+    return data_folder("example_scene") if text == "example" and not path.exists() else path
+
+
+@contextmanager
+def _bar(title: str, total: float | None, quiet: bool) -> Iterator[Callable[..., None]]:
+    """A progress bar on stderr: the yielded function advances it by its first argument and shows the text of its second."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(24), TextColumn("{task.percentage:3.0f}%"), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn(), TextColumn("{task.fields[news]}"))  # fmt: skip
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, refresh_per_second=4) as progress:
+        task = progress.add_task(title, total=total, news="")
+
+        def advance(amount: float, news: str | None = None, total: float | None = None) -> None:
+            progress.update(task, advance=amount, total=total, **({} if news is None else {"news": news}))
+
+        yield advance
+
+
+def _load(run: Path | None) -> tuple[Path, Any, Any]:
+    """Run folder, field, and the scene it was fitted to."""
+    from mmsynth.field.field import Field
+    from mmsynth.runs import finished_run
+    from mmsynth.scene.load import load_scene
+
+    path = finished_run(run)
+    field = Field.load(path)
+    return path, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))
+
+
+@command("info")
+def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
+    """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
+    from mmsynth.scene.info import describe, render_text
+    from mmsynth.scene.load import load_scene
+
+    description = describe(load_scene(_scene_path(scene)))
+    print(json.dumps(description) if as_json else render_text(description))
+
+
+@command("fit")
+def fit(
+    scene: SceneArgument,
+    run: RunOption = None,
+    recipe: Annotated[str | None, typer.Option(help="packaged recipe or TOML file")] = None,
+    modalities: Annotated[str | None, typer.Option(help="fit these only, e.g. rgb,ms")] = None,
+    budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Learn the field of a scene."""
+    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.trainer import Progress, pick_device
+    from mmsynth.fitting.trainer import fit as fit_field
+    from mmsynth.report.report import write_report
+    from mmsynth.runs import mark_latest, new_run, run_to_resume
+    from mmsynth.scene.load import load_scene
+
+    if steps is not None and budget is not None:
+        raise InputError("--steps and --budget: give one of the two.")
+    seconds = _seconds(budget) if budget else None
+    loaded = load_scene(_scene_path(scene), _names(modalities))
+    name = loaded.root.resolve().name
+    folder = run or (run_to_resume(name) if resume else new_run(name))
+    say = (lambda *_: None) if as_json else print
+    for problem in loaded.problems:
+        say(f"note: {problem}")
+    with _bar("fit", 1.0, as_json) as advance:
+        done = 0.0
+
+        def on_step(news: Progress) -> None:
+            nonlocal done
+            if news.step % 5 == 0 or news.done >= 1.0:
+                psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
+                advance(news.done - done, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
+                done = news.done
+
+        field = fit_field(
+            loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume,
+            on_start=lambda needs: [say(f"needs {k}: {v}") for k, v in needs.evidence.items()] and None, on_step=on_step,
+        )  # fmt: skip
+    write_report(folder, field, loaded)
+    mark_latest(folder)
+    manifest = field.manifest
+    psnr = {n: round(v, 2) for n, v in manifest["train_psnr"].items()}
+    if as_json:
+        print(json.dumps({"run": str(folder), "steps": manifest["steps"], "seconds": manifest["seconds"], "train_psnr": psnr, "rays_per_s": manifest["rays_per_s"], "samples_per_s": manifest["samples_per_s"]}))  # fmt: skip
+    else:
+        shown = ", ".join(f"{n} {v:.1f}" for n, v in psnr.items())
+        print(f"{manifest['steps']} steps in {manifest['seconds']['fit']:.0f} s, {manifest['rays_per_s']:,.0f} rays/s; PSNR on training pixels [dB]: {shown}")
+        print(f"wrote {folder}/ (field.safetensors, manifest.json, preview.png, report.html)")
+
+
+@command("evaluate")
+def evaluate(run: RunOption = None, as_json: JsonOption = False) -> None:
+    """Score the test views."""
+    from mmsynth.operations.evaluate import evaluate as score
+    from mmsynth.operations.evaluate import render_text
+    from mmsynth.report.report import write_report
+
+    folder, field, scene = _load(run)
+    with _bar("evaluate", None, as_json) as advance:
+        scores = score(field, scene, progress=lambda rays: advance(rays))
+    write_report(folder, field, scene, scores)
+    print(json.dumps(scores) if as_json else render_text(scores))
+
+
+@command("convert")
+def convert(
+    source: Annotated[str, typer.Option("--from", help="modality whose frames give pose and pixel grid")],
+    target: Annotated[str, typer.Option("--to", help="modality to synthesise")],
+    run: RunOption = None,
+    views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
+    out: Annotated[Path | None, typer.Option(help="default: RUN/convert/FROM_to_TO")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Another modality at the poses of the frames of one."""
+    from mmsynth.operations.convert import convert as convert_frames
+
+    folder, field, scene = _load(run)
+    (a,), (b,) = _names(source) or [""], _names(target) or [""]
+    chosen = _views(views)
+    destination = out or folder / "convert" / f"{a}_to_{b}"
+    with _bar(f"{a} to {b}", None, as_json) as advance:
+        written = convert_frames(field, scene, a, b, destination, chosen, progress=lambda rays: advance(rays))
+    _tell(destination, written, as_json)
+
+
+@command("generate-dataset")
+def generate_dataset(
+    poses: Annotated[Path, typer.Option(help="transforms.json, camera_path.json, COLMAP images.txt or a trajectory; looked for here, then in the scene")],
+    run: RunOption = None,
+    rig: Annotated[str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")] = "aligned",
+    modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
+    out: Annotated[Path | None, typer.Option(help="default: RUN/dataset")] = None,
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
+    verify: Annotated[bool, typer.Option("--verify", help="only check a finished dataset against its checksums")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """An aligned dataset: every modality, depth, normal, opacity, intrinsics and pose per view."""
+    from mmsynth.operations import dataset
+    from mmsynth.operations.trajectories import load_views
+
+    folder, field, scene = _load(run)
+    destination = out or folder / "dataset"
+    if verify:
+        problems = dataset.verify(destination)
+        if problems:
+            raise InputError(f"{destination}: {len(problems)} problems, first: {problems[0]}")
+        print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")
+        return
+    path = poses if poses.exists() or poses.is_absolute() else scene.root / poses
+    views = load_views(path if path.exists() else poses, field, scene)
+    with _bar("dataset", len(views), as_json) as advance:
+        written = dataset.generate_dataset(field, views, destination, _names(modalities), rig, file_format, progress=lambda n: advance(n))
+    _tell(destination, written, as_json)
+
+
+@command("mesh")
+def mesh(
+    run: RunOption = None,
+    resolution: Annotated[int, typer.Option(min=8, max=4096, help="voxels across the region of interest")] = 256,
+    out: Annotated[Path | None, typer.Option(help="PLY, OBJ, STL or GLB; default: RUN/mesh.ply")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The surface, in the input's frame and unit."""
+    from mmsynth.operations.mesh import extract_mesh, write_mesh
+
+    folder, field, _ = _load(run)
+    destination = out or folder / "mesh.ply"
+    with _bar("mesh", None, as_json) as advance:
+        surface = extract_mesh(field, resolution, progress=lambda n: advance(n))
+    write_mesh(surface, destination, field.unit)
+    facts = {"out": str(destination), "vertices": len(surface.vertices), "faces": len(surface.faces), "bounds": surface.bounds.tolist(), "unit": field.unit}
+    print(json.dumps(facts) if as_json else f"wrote {destination}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces, in {field.unit}")
+
+
+@command("doctor")
+def doctor(as_json: JsonOption = False) -> None:
+    """Versions, threads, GPU, kernels, and what to do."""
+    from mmsynth.doctor import diagnose, render_text
+
+    facts = diagnose()
+    print(json.dumps(facts) if as_json else render_text(facts))
+
+
+def _tell(destination: Path, written: list[Path], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({"out": str(destination), "files": [str(p) for p in written]}))
+    else:
+        print(f"wrote {len(written)} files into {destination}/")
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="print the version")] = False) -> None:
+    if version:
+        import mmsynth
+
+        print(mmsynth.__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point of the ``mmsynth`` command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

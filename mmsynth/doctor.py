@@ -1,0 +1,43 @@
+"""Is this machine ready: versions, threads, GPU, compiled kernels, and what to do about it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from typing import Any
+
+import torch
+
+from mmsynth.field.kernels import cpu
+
+_PACKAGES = ("mmsynth", "torch", "numba", "numpy", "kornia", "opencv-contrib-python-headless", "scikit-image", "trimesh", "pymeshlab", "triton", "mitsuba")
+
+
+def diagnose() -> dict[str, Any]:
+    """Facts as one JSON-serialisable dict; ``advice`` holds one sentence per thing worth doing."""
+    versions = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = None
+    gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    compiled = cpu.is_compiled()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    advice = []
+    if not compiled:
+        advice.append("The CPU kernels are not compiled yet: the first fit does it, once, and says so.")
+    if torch.get_num_threads() > cores:
+        advice.append(f"torch uses {torch.get_num_threads()} threads on {cores} cores: set OMP_NUM_THREADS={cores}.")
+    if gpu:
+        advice.append("With --device cuda the field runs on torch operations; the kernels compiled for speed are the CPU's.")
+    return {"python": platform.python_version(), "versions": versions, "cores": cores, "threads": torch.get_num_threads(), "gpu": gpu, "kernels_compiled": compiled, "advice": advice}  # fmt: skip
+
+
+def render_text(facts: dict[str, Any]) -> str:
+    """The facts as lines of text."""
+    lines = [f"python {facts['python']}, {facts['cores']} cores, {facts['threads']} threads, GPU: {facts['gpu'] or 'none'}"]
+    lines += [f"  {name} {version or 'not installed'}" for name, version in facts["versions"].items()]
+    lines.append(f"CPU kernels compiled: {'yes' if facts['kernels_compiled'] else 'no'}")
+    return "\n".join(lines + facts["advice"])

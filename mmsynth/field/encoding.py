@@ -1,0 +1,55 @@
+"""Encodings: the multiresolution hash grid of positions, and spherical harmonics of directions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mmsynth.field import kernels
+
+
+class HashGrid(nn.Module):
+    """Multiresolution hash grid over the cube [-extent, extent]³ (Müller et al. 2022), 2 features per level.
+
+    Args:
+        levels: number of levels. rows_log2: log2 of the rows per level.
+        coarsest, finest: cells per axis of the first and the last level; geometric in between.
+    """
+
+    resolutions: Tensor
+
+    def __init__(self, levels: int, rows_log2: int, coarsest: int, finest: int, extent: float = 1.0) -> None:
+        super().__init__()
+        growth = (max(finest, coarsest) / coarsest) ** (1.0 / max(levels - 1, 1))
+        self.register_buffer("resolutions", torch.tensor([int(coarsest * growth**i + 0.5) for i in range(levels)]), persistent=False)
+        self.tables = nn.Parameter(torch.empty(levels, 2**rows_log2, 2).uniform_(-1e-4, 1e-4))
+        self.extent = extent
+
+    @property
+    def width(self) -> int:
+        """Numbers per position."""
+        return 2 * self.tables.shape[0]
+
+    def cell(self, active: int) -> float:
+        """Cell size of the finest active level."""
+        return 2.0 * self.extent / float(self.resolutions[min(active, len(self.resolutions)) - 1])
+
+    def forward(self, positions: Tensor, active: int) -> Tensor:
+        """(N, 3) → (N, width); levels from ``active`` on are zero and cost nothing."""
+        unit = (positions * (0.5 / self.extent) + 0.5).clamp(0.0, 1.0)
+        return kernels.hash_encode(unit, self.tables, self.resolutions, active)
+
+
+def spherical_harmonics(d: Tensor) -> Tensor:
+    """Real spherical harmonics up to degree 3 (orthonormal), (N, 3) unit vectors → (N, 16)."""
+    x, y, z = d.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack([
+        torch.full_like(x, 0.28209479177387814),
+        0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x,
+        1.0925484305920792 * x * y, 1.0925484305920792 * y * z, 0.31539156525252005 * (3 * zz - 1),
+        1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
+        0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z, 0.4570457994644658 * y * (5 * zz - 1),
+        0.3731763325901154 * z * (5 * zz - 3), 0.4570457994644658 * x * (5 * zz - 1), 1.445305721320277 * z * (xx - yy),
+        0.5900435899266435 * x * (xx - 3 * yy),
+    ], -1)  # fmt: skip

@@ -1,0 +1,313 @@
+"""The field of a scene: what is learned by a fit and asked by every operation."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from mmsynth.errors import InputError
+from mmsynth.field import rendering
+from mmsynth.field.background import Background
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.occupancy import Occupancy
+from mmsynth.field.radiance import Shader
+from mmsynth.field.rendering import Sampling
+from mmsynth.field.surface import Surface
+from mmsynth.files import read_json, write_atomic, write_json
+from mmsynth.scene.scene import Region, Sensor
+from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.polarization import analyser_axes
+
+_BACKGROUND_FEATURES = 16
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera sees, all modalities at every pixel (H, W).
+
+    Attributes:
+        channels: per modality (H, W, C) float32, linear, 1.0 = the sensor's full scale; for a polarization modality the
+            intensities behind the sensor's analysers, in this camera's own frame.
+        stokes: per polarization modality (H, W, 3): S0, S1, S2 in this camera's x-axis frame.
+        depth_z, depth_ray: (H, W) float32 along the optical axis, along the ray; scene unit, NaN = no hit.
+        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit.
+        opacity: (H, W) float32 in [0, 1].
+        valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
+    """
+
+    channels: dict[str, np.ndarray]
+    stokes: dict[str, np.ndarray]
+    depth_z: np.ndarray
+    depth_ray: np.ndarray
+    normal: np.ndarray
+    opacity: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Design:
+    """The sizes of a field's parts: what a scene was found to need (see fitting.needs). Stored with the field."""
+
+    surface_levels: int = 8
+    surface_rows_log2: int = 16
+    surface_finest: int = 128
+    radiance_levels: int = 10
+    radiance_rows_log2: int = 16
+    radiance_finest: int = 256
+    background: bool = False
+    background_levels: int = 8
+    background_rows_log2: int = 15
+    background_finest: int = 256
+    surface_hidden: int = 32
+    radiance_hidden: int = 64
+    coarsest: int = 16
+    occupancy: int = 64
+    initial_radius: float = 0.5
+
+
+class Field(nn.Module):
+    """One radiance field of a scene.
+
+    The parts work in a normalised frame in which ``region`` is the unit ball; every public method takes and gives the
+    scene's world frame and unit.
+
+    Attributes:
+        sensors: the modalities it knows. cameras: representative intrinsics of each.
+        rig: sensor → (4, 4) sensor_to_reference, scene unit; the reference is the first sensor.
+        sampling: how finely it is rendered. manifest: everything known about the fit.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        sensors: dict[str, Sensor],
+        levels: dict[str, float],
+        region: Region,
+        unit: str = "input unit",
+        cameras: dict[str, Camera] | None = None,
+        rig: dict[str, np.ndarray] | None = None,
+    ) -> None:
+        super().__init__()
+        d = self.design = design
+        self.sensors, self.levels, self.region, self.unit = sensors, levels, region, unit
+        self.cameras, self.rig = cameras or {}, rig or {}
+        self.manifest: dict[str, Any] = {}
+        self.surface = Surface(HashGrid(d.surface_levels, d.surface_rows_log2, d.coarsest, d.surface_finest), d.surface_hidden, d.initial_radius)
+        self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest)
+        self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, levels)
+        self.background: Background | None = None
+        if d.background:
+            grid = HashGrid(d.background_levels, d.background_rows_log2, d.coarsest, d.background_finest, extent=2.0)
+            shader = Shader(_BACKGROUND_FEATURES, d.radiance_hidden // 2, sensors, levels)
+            self.background = Background(grid, d.surface_hidden, _BACKGROUND_FEATURES, shader)
+        self.occupancy = Occupancy(d.occupancy)
+        self.sampling = Sampling(20.0, 0.05, d.surface_levels, d.radiance_levels, d.background_levels)
+
+    @property
+    def device(self) -> torch.device:
+        return self.occupancy.states.device
+
+    def to_normalised(self, points: np.ndarray) -> Tensor:
+        """World points (..., 3) → normalised frame, float32 on the field's device."""
+        unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius
+        return torch.from_numpy(unit.astype(np.float32)).to(self.device)
+
+    @torch.no_grad()
+    def sdf(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance in the scene's unit, positive outside: (N, 3) → (N,) float32."""
+        parts = self.to_normalised(points).split(65536)
+        values = [self.surface(part, self.sampling.active_surface) for part in parts]
+        return torch.cat(values).cpu().numpy() * np.float32(self.region.radius) if values else np.empty(0, np.float32)
+
+    def pixel_values(
+        self, hits: rendering.Hits, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling
+    ) -> Callable[[str, Tensor | None, slice], Tensor]:
+        """Shade rays once; the result gives the values of any modality for any slice of them (axes as in ``Shader.values``)."""
+        front = self.shader.hidden(hits.features, directions)
+        background = self.background
+        behind = torch.nonzero(hits.opacity.detach() < 0.995)[:, 0] if background is not None else None
+        position = hidden = None
+        if background is not None and behind is not None and len(behind):
+            hidden = rendering.background_hidden(background, origins[behind], directions[behind], jitter[behind], sampling)
+            position = torch.full((len(origins),), -1, dtype=torch.int64, device=origins.device)
+            position[behind] = torch.arange(len(behind), device=origins.device)
+
+        def values(modality: str, axes: Tensor | None, rays: slice) -> Tensor:
+            out = hits.opacity[rays, None] * self.shader.values(modality, front[rays], axes)
+            if background is not None and position is not None and hidden is not None:
+                here = position[rays]
+                rows = torch.nonzero(here >= 0)[:, 0]
+                light = background.shader.values(modality, hidden[here[rows]], None if axes is None else axes[rows])
+                out = out.index_add(0, rows, (1.0 - hits.opacity[rays][rows, None]) * light)
+            return out
+
+        return values
+
+    @torch.no_grad()
+    def render_rays(
+        self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool, stokes: bool = True
+    ) -> dict[str, Tensor]:
+        """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth, normal."""
+        rays = len(origins)
+        jitter = torch.full((rays,), 0.5, device=origins.device)
+        hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
+        values = self.pixel_values(hits, origins, directions, jitter, self.sampling)
+        out = {"opacity": hits.opacity.clamp(0.0, 1.0)}
+        everything = slice(0, rays)
+        for name in modalities:
+            angles = self.sensors[name].polarizer_angles_deg
+            if angles is None:
+                out[name] = values(name, None, everything)
+                continue
+            degrees = torch.tensor((*angles, 0.0, 45.0, 90.0), device=origins.device)
+            axes = analyser_axes(directions, camera_x, torch.deg2rad(degrees).expand(rays, -1))
+            behind_analysers = values(name, axes, everything)
+            out[name] = behind_analysers[:, :-3]
+            i0, i45, i90 = behind_analysers[:, -3:].unbind(1)
+            if stokes:
+                out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
+        if geometry:
+            depth = rendering.median_depth(hits, rays)
+            hit = torch.nonzero(torch.isfinite(depth))[:, 0]
+            normal = torch.full_like(directions, float("nan"))
+            epsilon = self.surface.grid.cell(self.sampling.active_surface)
+            slope = self.surface.gradient(origins[hit] + directions[hit] * depth[hit, None], epsilon, self.sampling.active_surface)
+            normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
+            out["depth"], out["normal"] = depth, normal
+        return out
+
+    def render(
+        self,
+        camera: Camera,
+        camera_to_world: np.ndarray,
+        modalities: Sequence[str] | None = None,
+        geometry: bool = True,
+        progress: Callable[[int], None] | None = None,
+    ) -> Rendering:
+        """Render a camera.
+
+        Args:
+            camera: intrinsics and lens; rays go through the distorted lens.
+            camera_to_world: (4, 4), OpenCV axes, scene unit. modalities: names, all when None.
+            progress: called with the number of rays done since the last call.
+        Raises:
+            InputError: an unknown modality, or a pose that is not finite.
+        """
+        names = self.check_modalities(modalities)
+        pose = np.asarray(camera_to_world, dtype=np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise InputError(f"pose: expected a finite 4x4 camera_to_world matrix, found shape {pose.shape} or NaN in it.")
+        in_camera, valid = ray_map(camera)
+        height, width = valid.shape
+        rows = np.flatnonzero(valid)
+        directions = torch.from_numpy((in_camera.reshape(-1, 3)[rows] @ pose[:3, :3].T).astype(np.float32)).to(self.device)
+        origin = self.to_normalised(pose[:3, 3])
+        camera_x = torch.from_numpy(pose[:3, 0].astype(np.float32)).to(self.device)
+        parts: dict[str, list[np.ndarray]] = {}
+        for part in directions.split(8192):
+            result = self.render_rays(origin.expand(len(part), 3), part, camera_x.expand(len(part), 3), names, geometry)
+            for key, value in result.items():
+                parts.setdefault(key, []).append(value.cpu().numpy())
+            if progress is not None:
+                progress(len(part))
+
+        def image(key: str, channels: int, fill: float) -> np.ndarray:
+            out = np.full((height * width, channels), fill, np.float32)
+            if key in parts:
+                out[rows] = np.concatenate(parts[key]).reshape(len(rows), channels)
+            return out.reshape(height, width, channels)
+
+        depth = image("depth", 1, np.nan)[..., 0] * np.float32(self.region.radius)
+        return Rendering(
+            channels={n: image(n, self.sensors[n].channel_count, np.nan) for n in names},
+            stokes={n: image(f"stokes/{n}", 3, np.nan) for n in names if self.sensors[n].is_polarization},
+            depth_z=(depth * in_camera[..., 2]).astype(np.float32),
+            depth_ray=depth,
+            normal=image("normal", 3, np.nan),
+            opacity=image("opacity", 1, 0.0)[..., 0],
+            valid=valid.copy(),
+        )
+
+    def check_modalities(self, modalities: Sequence[str] | None) -> list[str]:
+        """The given names, or all of them.
+
+        Raises:
+            InputError: one is unknown to this field.
+        """
+        names = list(self.sensors) if modalities is None else list(modalities)
+        for name in names:
+            if name not in self.sensors:
+                raise InputError(f"modality {name!r}: not in this field, expected one of {', '.join(self.sensors)}.")
+        return names
+
+    def save(self, run: Path) -> None:
+        """Write ``field.safetensors`` and ``manifest.json`` into the run folder, each atomically, the manifest last."""
+        tensors = {k: v.detach().cpu().contiguous() for k, v in self.state_dict().items()}
+        write_atomic(run / "field.safetensors", lambda path: save_file(tensors, path))
+        self.manifest["field"] = {
+            "design": asdict(self.design),
+            "sampling": asdict(self.sampling),
+            "levels": self.levels,
+            "region": asdict(self.region),
+            "unit": self.unit,
+            "sensors": [_sensor_to_json(s) for s in self.sensors.values()],
+            "cameras": {n: asdict(c) for n, c in self.cameras.items()},
+            "rig": {n: m.tolist() for n, m in self.rig.items()},
+        }
+        self.manifest["saved"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        write_json(run / "manifest.json", self.manifest)
+
+    @staticmethod
+    def load(run: Path, device: str = "cpu") -> Field:
+        """Read a finished run.
+
+        Raises:
+            InputError: no such run, or a file of it is missing, broken or of another version.
+        """
+        run = Path(run)
+        if not (run / "manifest.json").is_file():
+            raise InputError(f"{run}: holds no finished fit (no manifest.json); run `mmsynth fit SCENE` first.")
+        manifest = read_json(run / "manifest.json")
+        try:
+            stored = manifest["field"]
+            sensors = {s["name"]: _sensor_from_json(s) for s in stored["sensors"]}
+            region = Region(tuple(stored["region"]["centre"]), stored["region"]["radius"])
+            cameras = {n: Camera(**{**c, "distortion": tuple(c["distortion"])}) for n, c in stored["cameras"].items()}
+            rig = {n: np.array(m) for n, m in stored["rig"].items()}
+            field = Field(Design(**stored["design"]), sensors, stored["levels"], region, stored["unit"], cameras, rig)
+            field.sampling = Sampling(**stored["sampling"])
+            field.load_state_dict(load_file(run / "field.safetensors"))
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{run / 'manifest.json'}: not the manifest of a fit of this version ({error}).") from error
+        except (OSError, SafetensorError, RuntimeError) as error:
+            raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
+        field.manifest = manifest
+        return field.to(device)
+
+
+def _sensor_to_json(sensor: Sensor) -> dict[str, Any]:
+    out = asdict(sensor)
+    out["mosaic"] = None if sensor.mosaic is None else sensor.mosaic.tolist()
+    return json.loads(json.dumps(out))
+
+
+def _sensor_from_json(stored: dict[str, Any]) -> Sensor:
+    angles = stored["polarizer_angles_deg"]
+    return Sensor(
+        name=stored["name"],
+        channels=tuple(stored["channels"]),
+        wavelengths_nm=tuple(stored["wavelengths_nm"]),
+        mosaic=None if stored["mosaic"] is None else np.array(stored["mosaic"]),
+        polarizer_angles_deg=None if angles is None else tuple(angles),
+        saturation=stored["saturation"],
+    )

@@ -1,0 +1,48 @@
+"""Where to sample: a grid over [-1, 1]³ whose cells are outside, shell (a surface may be there) or solid.
+
+The signed distance is a certificate: a cell whose centre is farther from the surface than its half diagonal holds none.
+The margin 7/s covers the soft surface: what is lost beyond it is an opacity of e⁻⁷ = 9e-4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID
+
+
+class Occupancy(nn.Module):
+    """Three-state grid, all shell at the start. It re-opens: a part of the certified cells is tested again at every update."""
+
+    states: Tensor
+
+    def __init__(self, resolution: int) -> None:
+        super().__init__()
+        self.register_buffer("states", torch.full((resolution,) * 3, SHELL, dtype=torch.uint8))
+
+    @torch.no_grad()
+    def update(self, sdf: Callable[[Tensor], Tensor], sharpness: float, generator: torch.Generator, share: float, slack: float = 1.5) -> bool:
+        """Classify all shell cells and a random ``share`` of the others anew.
+
+        Args:
+            sdf: (N, 3) → (N,). slack: how far |∇sdf| may exceed 1 (it does while training).
+        Returns:
+            False when no shell was left and the whole grid was opened again: nothing to see, worth a report.
+        """
+        grid = self.states.shape[0]
+        flat = self.states.view(-1)
+        again = torch.rand(flat.shape[0], generator=generator) < share
+        cells = torch.nonzero((flat == SHELL) | again.to(flat.device))[:, 0]
+        index = torch.stack([cells // (grid * grid), cells // grid % grid, cells % grid], -1)
+        margin = slack * 3**0.5 / grid + 7.0 / sharpness
+        for part in torch.arange(len(cells), device=cells.device).split(65536):
+            value = sdf((index[part].float() + 0.5) * (2.0 / grid) - 1.0)
+            state = torch.where(value > margin, OUTSIDE, torch.where(value < -margin, SOLID, SHELL))
+            flat[cells[part]] = state.to(torch.uint8)
+        if bool((flat == SHELL).any()):
+            return True
+        flat.fill_(SHELL)
+        return False

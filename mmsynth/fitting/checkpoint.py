@@ -1,0 +1,33 @@
+"""Checkpoints: everything a killed fit needs to go on to the same result, in one file, replaced atomically."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mmsynth.errors import InputError
+from mmsynth.files import write_atomic
+
+_NAME = "state.pt"
+
+
+def write_checkpoint(run: Path, state: dict[str, Any]) -> None:
+    """Replace the run's checkpoint. ``state`` holds tensors, numbers, strings and containers of them."""
+    write_atomic(run / "checkpoint" / _NAME, lambda path: torch.save(state, path))
+
+
+def read_checkpoint(run: Path) -> dict[str, Any] | None:
+    """The run's checkpoint, or None when it has none.
+
+    Raises:
+        InputError: the file is broken.
+    """
+    path = run / "checkpoint" / _NAME
+    if not path.is_file():
+        return None
+    try:
+        return torch.load(path, weights_only=True)
+    except Exception as error:  # torch raises many kinds for a broken archive
+        raise InputError(f"{path}: not a readable checkpoint ({str(error).splitlines()[0]}).") from error

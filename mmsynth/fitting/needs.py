@@ -1,0 +1,98 @@
+"""What this scene needs: sizes and parts decided from the cameras and pixels, with the evidence kept.
+
+Model only what a scene needs: no background where nothing but black lies behind the region of interest, no tensor head
+without a polarization sensor (heads follow the sensors), no grid level finer than a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from mmsynth.field.field import Design
+from mmsynth.fitting.measurements import Measurements
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Needs:
+    """The choice and why: ``footprint`` is a pixel's size at the region's centre, in radii; ``evidence`` one line per choice."""
+
+    design: Design
+    footprint: float
+    sharpness_end: float
+    black_background: bool
+    evidence: dict[str, str]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, seed: int) -> Needs:
+    """Look at the cameras and at 4096 random pixels per modality."""
+    footprint = _footprint(measurements)
+    outside, bright, rays = _look_outside(measurements, np.random.default_rng((seed, 7)))
+    evidence = {}
+    if recipe.background != "auto":
+        background = recipe.background == "on"
+        evidence["background"] = f"{recipe.background}: asked for by the recipe"
+    elif scene.black_background or any(m.has_alpha for m in measurements.values()):
+        background = False
+        evidence["background"] = "off: the input says that it is black or transparent"
+    elif outside < 0.005:
+        background = False
+        evidence["background"] = f"off: {outside:.1%} of {rays} sampled pixels see past the region of interest"
+    else:
+        background = bright > 0.05
+        verdict = "on" if background else "off"
+        evidence["background"] = f"{verdict}: {outside:.1%} of {rays} sampled pixels see past the region of interest, {bright:.1%} of these are not black"
+    # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
+    surface_finest = int(np.clip(recipe.surface_cells / footprint, 32, 1024))
+    radiance_finest = int(np.clip(recipe.radiance_cells / footprint, 64, 2048))
+    evidence["resolution"] = f"a pixel is {footprint:.2g} radii at the centre: finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
+    pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
+    evidence["tensor_head"] = f"on: {', '.join(pol)}" if pol else "off: no polarization sensor"
+    design = Design(
+        surface_levels=recipe.surface_levels,
+        surface_rows_log2=recipe.surface_rows_log2,
+        surface_finest=surface_finest,
+        radiance_levels=recipe.radiance_levels,
+        radiance_rows_log2=recipe.radiance_rows_log2,
+        radiance_finest=radiance_finest,
+        background=background,
+        background_finest=int(np.clip(2.0 / footprint, 64, 512)),
+        surface_hidden=recipe.surface_hidden,
+        radiance_hidden=recipe.radiance_hidden,
+        occupancy=recipe.occupancy_resolution,
+        initial_radius=recipe.initial_radius,
+    )
+    black = not background and outside >= 0.005
+    return Needs(design, footprint, max(recipe.sharpness_end / footprint, 2 * recipe.sharpness_start), black, evidence)
+
+
+def _footprint(measurements: dict[str, Measurements]) -> float:
+    """Median over frames of a pixel's size at the region's centre, in radii; a camera inside counts as one radius away."""
+    sizes = []
+    for m in measurements.values():
+        focal = np.array([0.5 * (m.cameras[c].fx + m.cameras[c].fy) for c in m.camera_index])
+        sizes.append(np.maximum(np.linalg.norm(m.origins, axis=1), 1.0) / focal)
+    return float(np.median(np.concatenate(sizes)))
+
+
+def _look_outside(measurements: dict[str, Measurements], random: np.random.Generator) -> tuple[float, float, int]:
+    """Share of pixels whose ray misses the region, share of these that are not black, number of pixels looked at."""
+    misses = bright = rays = 0
+    for m in measurements.values():
+        frame, pixel = m.pick(4096, random)
+        origins, directions = m.rays(frame, pixel)
+        along = np.einsum("ni,ni->n", origins, directions)
+        closest = np.linalg.norm(origins - directions * np.minimum(along, 0.0)[:, None], axis=1)
+        values = m.read(frame, pixel)[0].mean(1)
+        missing = closest > 1.0
+        misses += int(missing.sum())
+        bright += int((values[missing] > 0.15 * np.quantile(values, 0.95)).sum())
+        rays += len(frame)
+    return misses / rays, bright / max(misses, 1), rays

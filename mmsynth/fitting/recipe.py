@@ -1,0 +1,71 @@
+"""A fit recipe: a TOML file read into one pydantic model. Defaults live here and nowhere else."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mmsynth.data import data_folder
+from mmsynth.errors import InputError
+
+
+class Recipe(BaseModel):
+    """How a field is fitted. Lengths are in units of the region's radius, progress runs from 0 to 1."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    background: Literal["auto", "on", "off"] = Field("auto", description="model what is outside the region of interest")
+    surface_levels: int = Field(8, ge=1, le=16)
+    surface_rows_log2: int = Field(16, ge=8, le=22)
+    radiance_levels: int = Field(10, ge=1, le=16)
+    radiance_rows_log2: int = Field(17, ge=8, le=22)
+    surface_cells: float = Field(1.0, gt=0, description="finest surface grid: cells per two pixel footprints")
+    radiance_cells: float = Field(2.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
+    surface_hidden: int = Field(32, ge=4, le=256)
+    radiance_hidden: int = Field(64, ge=4, le=256)
+    background_samples: int = Field(16, ge=2, le=128)
+    occupancy_resolution: int = Field(64, ge=8, le=256)
+    occupancy_every: int = Field(16, ge=1, description="steps between updates of the occupancy grid")
+    initial_radius: float = Field(0.5, gt=0, lt=1)
+    samples_per_step: int = Field(24576, ge=256, description="surface samples a step; the number of rays follows")
+    rays_at_start: int = Field(512, ge=1)
+    sharpness_start: float = Field(20.0, gt=0)
+    sharpness_end: float = Field(4.0, gt=0, description="at the end, in units of 1 / pixel footprint")
+    sharpness_until: float = Field(0.6, gt=0, le=1, description="progress at which the sharpness reaches its end")
+    levels_until: float = Field(0.4, gt=0, le=1, description="progress at which all levels of the grids are active")
+    learning_rate_grid: float = Field(1e-2, gt=0)
+    learning_rate_network: float = Field(3e-3, gt=0)
+    learning_rate_end: float = Field(0.05, gt=0, le=1, description="factor at the end")
+    eikonal: float = Field(0.1, ge=0)
+    eikonal_points: int = Field(1024, ge=8)
+    emptiness: float = Field(0.02, ge=0, description="weight of opacity on black pixels of a black-background scene")
+    opacity: float = Field(0.5, ge=0, description="weight of opacity against masks or alpha, where the scene has them")
+
+
+def load_recipe(name_or_path: str | None) -> Recipe:
+    """A packaged recipe by name, or a TOML file.
+
+    Raises:
+        InputError: no such recipe, broken TOML, an unknown key, or a value out of range.
+    """
+    if name_or_path is None:
+        return Recipe()  # type: ignore[call-arg]
+    path = Path(name_or_path)
+    if not path.suffix:
+        folder = data_folder("recipes")
+        path = folder / f"{name_or_path}.toml"
+        if not path.is_file():
+            known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+            raise InputError(f"recipe {name_or_path!r}: not found, expected one of {known} or a TOML file.")
+    try:
+        return Recipe(**tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise InputError(f"{path}: could not be read ({error.strerror}).") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML ({error}).") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}.") from error

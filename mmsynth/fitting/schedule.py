@@ -1,0 +1,38 @@
+"""What changes while a fit runs, as functions of its progress in [0, 1]."""
+
+from __future__ import annotations
+
+import math
+
+from mmsynth.field.rendering import Sampling
+from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.recipe import Recipe
+
+
+def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
+    """Sharpness grows exponentially to its end, the step follows it, and grid levels open one by one."""
+    grown = min(1.0, progress / recipe.sharpness_until)
+    sharpness = recipe.sharpness_start * (needs.sharpness_end / recipe.sharpness_start) ** grown
+    opened = min(1.0, progress / recipe.levels_until)
+
+    def active(levels: int) -> int:
+        first = min(4, levels)
+        return first + int(round(opened * (levels - first)))
+
+    design = needs.design
+    return Sampling(
+        sharpness=sharpness,
+        # three steps across the soft surface (its width is about 3.5 / s); never coarser than a twentieth of the radius
+        step=min(0.05, 2.0 / sharpness),
+        active_surface=active(design.surface_levels),
+        active_radiance=active(design.radiance_levels),
+        active_background=active(design.background_levels),
+        background_samples=recipe.background_samples,
+    )
+
+
+def learning_rate_factor(progress: float, recipe: Recipe) -> float:
+    """A short linear rise, then level, then exponential decay over the last two thirds."""
+    rise = min(1.0, progress / 0.01)
+    fall = max(0.0, (progress - 0.33) / 0.67)
+    return max(rise, 0.02) * math.exp(math.log(recipe.learning_rate_end) * fall)

@@ -1,0 +1,354 @@
+"""The compact trainer: random rays of every modality, one field, one loss."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import mmsynth
+from mmsynth.errors import InputError
+from mmsynth.field import kernels, rendering
+from mmsynth.field.field import Field
+from mmsynth.files import write_text
+from mmsynth.fitting import losses
+from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
+from mmsynth.fitting.measurements import Batch, Measurements, load_measurements
+from mmsynth.fitting.needs import Needs, assess
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
+from mmsynth.scene.scene import Scene
+
+CHECKPOINT_SECONDS = 60.0
+_BAD_STEPS = 20
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One line of news: ``done`` in [0, 1], running means of loss and PSNR [dB] per modality, speeds over the fit."""
+
+    step: int
+    done: float
+    elapsed: float
+    loss: float
+    psnr: dict[str, float]
+    rays_per_s: float
+    samples_per_s: float
+
+
+@dataclass
+class _State:
+    step: int = 0
+    elapsed: float = 0.0
+    rays: int = 0
+    rays_total: int = 0
+    samples_total: int = 0
+    bad_steps: int = 0
+    reopened: int = 0
+
+
+class Trainer:
+    """A fit that can be stopped anywhere and goes on to the same field.
+
+    Every random number of a step comes from (seed, step), so the only state is the parameters, the optimiser, the
+    occupancy grid and the counters. With ``steps`` the schedule depends on the step alone and the result is the same
+    for any interruption; with ``budget`` it follows the clock.
+    """
+
+    def __init__(self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str) -> None:
+        if (steps is None) == (budget is None):
+            raise InputError("fit: give either a number of steps or a time budget, not both.")
+        self.recipe, self.steps, self.budget, self.seed = recipe, steps, budget, seed
+        self.device = torch.device(device)
+        torch.manual_seed(seed)
+        self.measurements: dict[str, Measurements] = load_measurements(scene)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed)
+        sensors = {n: m.sensor for n, m in self.measurements.items()}
+        levels = {n: m.level for n, m in self.measurements.items()}
+        cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
+        self.field = Field(self.needs.design, sensors, levels, scene.region, scene.unit, cameras, rig_of(scene)).to(self.device)
+        grids = [p for n, p in self.field.named_parameters() if n.endswith("tables")]
+        networks = [p for n, p in self.field.named_parameters() if not n.endswith("tables")]
+        self.optimiser = torch.optim.Adam(
+            [{"params": grids, "base": recipe.learning_rate_grid}, {"params": networks, "base": recipe.learning_rate_network}],
+            betas=(0.9, 0.99),
+            eps=1e-15,
+            fused=True,
+        )
+        self.state = _State(rays=recipe.rays_at_start)
+        self.mean_loss = math.nan
+        self.mean_error: dict[str, float] = {}
+
+    @property
+    def progress(self) -> float:
+        """Share of the fit that is done, in [0, 1]."""
+        if self.steps is not None:
+            return min(1.0, self.state.step / self.steps)
+        return min(1.0, self.state.elapsed / self.budget)  # type: ignore[operator]
+
+    def run_step(self) -> None:
+        """One optimiser step."""
+        state, recipe, field = self.state, self.recipe, self.field
+        random = np.random.default_rng((self.seed, 1, state.step))
+        generator = torch.Generator().manual_seed(int(random.integers(2**62)))
+        sampling = sampling_at(self.progress, recipe, self.needs)
+        if state.step % recipe.occupancy_every == 0:
+            share = 1.0 if state.step == 0 else 1 / 16
+            sdf = lambda x: field.surface(x, sampling.active_surface)  # noqa: E731
+            if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
+                state.reopened += 1
+        per_modality = max(1, state.rays // len(self.measurements))
+        batches = [m.batch(per_modality, random, self.device) for m in self.measurements.values()]
+        loss, errors, samples = self._loss(batches, sampling, generator)
+        if not bool(torch.isfinite(loss)):
+            self._skip("the loss is not finite")
+            return
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        factor = learning_rate_factor(self.progress, recipe)
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["base"] * factor
+        self.optimiser.step()
+        keep = 0.98 if state.step else 0.0
+        self.mean_loss = float(loss.detach()) if not state.step else keep * self.mean_loss + (1 - keep) * float(loss.detach())
+        for name, error in errors.items():
+            self.mean_error[name] = keep * self.mean_error.get(name, error) + (1 - keep) * error
+        state.rays_total += per_modality * len(batches)
+        state.samples_total += samples
+        # a fixed number of samples a step; the number of rays follows, by at most a factor of two either way
+        ratio = min(2.0, max(0.5, recipe.samples_per_step / max(samples, 1)))
+        state.rays = int(min(65536, max(len(batches), 0.5 * state.rays * (1 + ratio))))
+        state.step += 1
+
+    def _loss(
+        self, batches: list[Batch], sampling: rendering.Sampling, generator: torch.Generator
+    ) -> tuple[torch.Tensor, dict[str, float], int]:
+        recipe, field = self.recipe, self.field
+        origins = torch.cat([b.origins for b in batches])
+        directions = torch.cat([b.directions for b in batches])
+        jitter = torch.rand(len(origins), generator=generator).to(self.device)
+        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
+        values = field.pixel_values(hits, origins, directions, jitter, sampling)
+        loss = torch.zeros((), device=self.device)
+        errors = {}
+        begin = 0
+        for batch in batches:
+            rays = slice(begin, begin + len(batch.origins))
+            begin = rays.stop
+            # a polarization mosaic has one analyser per ray and so one value; other mosaics pick their channel
+            predicted = values(batch.modality, batch.axes, rays)
+            if batch.channel is not None and batch.axes is None:
+                predicted = predicted.gather(1, batch.channel[:, None])
+            difference = losses.residual(predicted, batch.target, field.sensors[batch.modality].saturation)
+            loss = loss + losses.photometric(difference, field.levels[batch.modality]) / len(batches)
+            errors[batch.modality] = float(difference.detach().square().mean())
+            opacity = hits.opacity[rays]
+            if batch.alpha is not None:
+                loss = loss + recipe.opacity * (opacity - batch.alpha).square().mean() / len(batches)
+            elif self.needs.black_background:
+                black = (batch.target.amax(1) < 0.02 * field.levels[batch.modality]).float()
+                loss = loss + recipe.emptiness * (opacity * black).mean() / len(batches)
+        if recipe.eikonal > 0:
+            loss = loss + recipe.eikonal * losses.eikonal(self._gradients(hits, sampling, generator))
+        return loss, errors, len(hits.t)
+
+    def _gradients(self, hits: rendering.Hits, sampling: rendering.Sampling, generator: torch.Generator) -> torch.Tensor:
+        """∇sdf at a random subset of the samples and at some points of the whole region."""
+        count = self.recipe.eikonal_points
+        anywhere = torch.rand(count // 4, 3, generator=generator).to(self.device) * 2 - 1
+        points = [anywhere]
+        if len(hits.t):
+            chosen = torch.randint(len(hits.t), (count - len(anywhere),), generator=generator).to(self.device)
+            points.append(hits.positions[chosen])
+        # float32 differences: one cell of the grid is far above the rounding of the sdf
+        epsilon = self.field.surface.grid.cell(sampling.active_surface)
+        return self.field.surface.gradient(torch.cat(points), epsilon, sampling.active_surface)
+
+    def _skip(self, reason: str) -> None:
+        self.state.step += 1
+        self.state.bad_steps += 1
+        if self.state.bad_steps >= _BAD_STEPS:
+            raise InputError(f"fit: {reason} in {self.state.bad_steps} steps (last: step {self.state.step}); the checkpoint is kept.")
+
+    def report(self) -> Progress:
+        """News for a progress bar."""
+        s = self.state
+        psnr = {n: -10 * math.log10(max(e, 1e-12)) for n, e in self.mean_error.items()}
+        rate = 1.0 / max(s.elapsed, 1e-9)
+        return Progress(s.step, self.progress, s.elapsed, self.mean_loss, psnr, s.rays_total * rate, s.samples_total * rate)
+
+    def checkpoint(self) -> dict[str, Any]:
+        """All state, as tensors and numbers."""
+        return {
+            "version": 1,
+            "task": self.task(),
+            "field": self.field.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "state": vars(self.state).copy(),
+            "mean_loss": self.mean_loss,
+            "mean_error": dict(self.mean_error),
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Take up a checkpoint.
+
+        Raises:
+            InputError: it belongs to another scene, recipe, seed or length.
+        """
+        ours, theirs = self.task(), saved["task"]
+        for key, value in ours.items():
+            if theirs.get(key) != value:
+                raise InputError(f"checkpoint: was made with {key} {theirs.get(key)}, this fit has {value}; give another --run or the same options.")
+        self.field.load_state_dict(saved["field"])
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.state = _State(**saved["state"])
+        self.mean_loss, self.mean_error = saved["mean_loss"], dict(saved["mean_error"])
+
+    def task(self) -> dict[str, Any]:
+        """What a checkpoint must agree on to be resumed."""
+        digest = hashlib.sha256()
+        for name, m in self.measurements.items():
+            digest.update(name.encode())
+            for part in (m.origins, m.rotations, *m.values):
+                digest.update(np.ascontiguousarray(part).tobytes())
+        return {
+            "scene": digest.hexdigest()[:16],
+            "recipe": json.dumps(self.recipe.model_dump(), sort_keys=True),
+            "seed": self.seed,
+            "steps": self.steps or 0,
+            "budget": self.budget or 0.0,
+        }
+
+
+def pick_device(name: str) -> str:
+    """``auto`` → cuda where there is one, else cpu.
+
+    Raises:
+        InputError: the device is unknown or not there.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name not in ("cpu", "cuda"):
+        raise InputError(f"--device {name!r}: expected auto, cpu or cuda.")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: torch finds no CUDA device here; use cpu.")
+    return name
+
+
+def rig_of(scene: Scene) -> dict[str, np.ndarray]:
+    """sensor → (4, 4) sensor_to_reference, from the first view that both saw; sensors that never shared a view are left out."""
+    reference = next(iter(scene.sensors))
+    poses = {f.view: f.camera_to_world for f in scene.frames_of(reference)}
+    rig = {reference: np.eye(4)}
+    for name in scene.sensors:
+        for frame in scene.frames_of(name):
+            if name != reference and frame.view in poses:
+                rig[name] = np.linalg.inv(poses[frame.view]) @ frame.camera_to_world
+                break
+    return rig
+
+
+def fit(
+    scene: Scene,
+    run: Path,
+    recipe: Recipe | None = None,
+    steps: int | None = None,
+    budget: float | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = False,
+    on_start: Callable[[Needs], None] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+) -> Field:
+    """Learn the field of a scene and write it into a run folder.
+
+    Args:
+        steps: length in optimiser steps, or ``budget``: length in seconds of training; 60 s when both are None.
+        resume: go on from the run's checkpoint, if it has one.
+        on_start: called once with what the scene was found to need. on_step: called after every step.
+    Raises:
+        InputError: the scene cannot be read, the run folder cannot be written, or a checkpoint does not fit.
+    """
+    if steps is None and budget is None:
+        budget = 60.0
+    kernels.announce_compilation()
+    trainer = Trainer(scene, recipe or Recipe(), steps, budget, seed, device)  # type: ignore[call-arg]
+    saved = read_checkpoint(run) if resume else None
+    log: list[str] = []
+    if saved is not None:
+        trainer.restore(saved)
+        if (run / "train.jsonl").is_file():
+            log = [x for x in (run / "train.jsonl").read_text().splitlines() if json.loads(x)["step"] <= trainer.state.step]
+    else:
+        # an empty checkpoint first: a run folder that cannot be written is known now and not after an hour
+        write_checkpoint(run, trainer.checkpoint())
+    if on_start is not None:
+        on_start(trainer.needs)
+    began, before = time.perf_counter(), trainer.state.elapsed
+    last_saved = last_logged = began
+    while trainer.progress < 1.0:
+        try:
+            trainer.run_step()
+        except KeyboardInterrupt:
+            # the step may be half applied: only the last checkpoint is safe to go on from
+            print(f"interrupted; go on with --resume from the checkpoint in {run}", file=sys.stderr)
+            raise
+        now = time.perf_counter()
+        trainer.state.elapsed = before + now - began
+        if on_step is not None:
+            on_step(trainer.report())
+        if now - last_logged > 1.0 or trainer.progress >= 1.0:
+            news = trainer.report()
+            log.append(json.dumps({"step": news.step, "elapsed": round(news.elapsed, 3), "loss": news.loss, "psnr": news.psnr}))
+            last_logged = now
+        if now - last_saved > CHECKPOINT_SECONDS:
+            write_checkpoint(run, trainer.checkpoint())
+            write_text(run / "train.jsonl", "\n".join(log) + "\n")
+            last_saved = time.perf_counter()
+    write_checkpoint(run, trainer.checkpoint())
+    write_text(run / "train.jsonl", "\n".join(log) + "\n")
+    return _finish(trainer, scene, run)
+
+
+def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
+    field, news = trainer.field, trainer.report()
+    field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
+    field.occupancy.update(lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0)
+    field.manifest = {
+        "mmsynth": mmsynth.__version__,
+        "scene": {"path": str(scene.root.resolve()), "format": scene.format, "hash": trainer.task()["scene"], "test_views": list(scene.split.test)},
+        "recipe": trainer.recipe.model_dump(),
+        "needs": trainer.needs.to_json(),
+        "seed": trainer.seed,
+        "steps": trainer.state.step,
+        "seconds": {"fit": news.elapsed},
+        "rays_per_s": news.rays_per_s,
+        "samples_per_s": news.samples_per_s,
+        "train_psnr": news.psnr,
+        "skipped_steps": trainer.state.bad_steps,
+        "grid_reopened": trainer.state.reopened,
+        "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        "threads": torch.get_num_threads(),
+        "cores": os.cpu_count(),
+        "device": str(trainer.device),
+        "conventions": {
+            "camera_axes": "OpenCV: x right, y down, z forward",
+            "pixels": "centre of the top-left pixel is (0, 0)",
+            "world": f"the input's own frame, {scene.unit}",
+            "radiance": "linear, 1.0 = full scale",
+            "polarization": "angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
+        },
+    }
+    field.save(run)
+    return field

@@ -1,0 +1,145 @@
+"""What was measured: sensors, frames and their poses, as plain frozen dataclasses.
+
+Conventions (every reader converts to these, every writer from these):
+
+* Camera axes are OpenCV's: x right, y down, z forward. ``camera_to_world`` is 4x4 float64 and rigid.
+* The centre of the top-left pixel is (0, 0).
+* The world frame is the input's own, in metres where the input says so (``Scene.unit``).
+* Pixel values are linear radiance, 1.0 = the sensor's full scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mmsynth.sensors.camera import Camera
+
+ALIASES = {
+    "infrared": "nir", "polarization": "pol", "polarisation": "pol", "multispectral": "ms",
+    "monochrome": "mono", "gray": "mono", "grey": "mono", "color": "rgb", "colour": "rgb",
+}  # fmt: skip
+
+
+def canonical_modality(name: str) -> str:
+    """``rgb mono nir pol ms`` and their aliases; any other name is kept, in lower case."""
+    name = name.strip().lower()
+    return ALIASES.get(name, name)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One member of the rig: how its pixels sample light.
+
+    Attributes:
+        name: canonical modality name, unique in the scene.
+        channels: one label per channel, in channel order.
+        wavelengths_nm: one per channel, None where unknown or broad.
+        mosaic: (k, k') int array, ``channel = mosaic[row % k][column % k']``; None: every pixel has all channels.
+        polarizer_angles_deg: one per channel for a polarization sensor, measured from image right towards image up;
+            None: plain radiance.
+        saturation: raw values at or above it are taken as clipped.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    wavelengths_nm: tuple[float | None, ...]
+    mosaic: np.ndarray | None = None
+    polarizer_angles_deg: tuple[float, ...] | None = None
+    saturation: float = 0.998
+
+    @property
+    def channel_count(self) -> int:
+        return len(self.channels)
+
+    @property
+    def is_polarization(self) -> bool:
+        return self.polarizer_angles_deg is not None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of one sensor.
+
+    Attributes:
+        sensor: name of its ``Sensor``.
+        view: the id of the view (macroframe) in the input; ids may have gaps.
+        path: the image file.
+        camera: intrinsics and lens of this frame (one shared object where frames share it).
+        camera_to_world: (4, 4) float64, rigid, OpenCV axes, in the scene's unit.
+        source_name: the modality's folder or key as the input spells it (used to find masks and ground truth).
+        mask: image file, non-zero = foreground; None where there is none.
+    """
+
+    sensor: str
+    view: int
+    path: Path
+    camera: Camera
+    camera_to_world: np.ndarray
+    source_name: str = ""
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Region:
+    """The region of interest: a ball in the world frame, in the scene's unit."""
+
+    centre: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Split:
+    """View ids to train on and to test on; disjoint."""
+
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+    source: str
+
+
+def make_split(views: Iterable[int], test: Iterable[int] = (), source: str = "") -> Split:
+    """Split view ids by the ``test`` ids that the input states; the others train.
+
+    Without any (or when they would leave nothing to train on) every tenth view tests: ids 9, 19, 29, ..., or the last
+    view if no id ends with 9.
+    """
+    ids = sorted(set(views))
+    stated = set(test)
+    chosen = tuple(view for view in ids if view in stated)
+    if not chosen or len(chosen) == len(ids):
+        chosen = tuple(view for view in ids if view % 10 == 9) or tuple(ids[-1:])
+        source = "every tenth view" if any(view % 10 == 9 for view in ids) else "the last view"
+    return Split(tuple(view for view in ids if view not in chosen), chosen, source)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a reader found.
+
+    Attributes:
+        root: the scene's folder. ``format``: which reader read it.
+        sensors: by canonical name, in the input's order; the first is the reference.
+        frames: sorted by (sensor order, view).
+        region: region of interest.
+        unit: "m" where the input says so, else "input unit".
+        black_background: True when the input says that what is outside the object is black or transparent,
+            None when it does not say.
+        problems: one sentence each, to be shown by ``mmsynth info`` (missing images, dropped frames, ...).
+    """
+
+    root: Path
+    format: str
+    sensors: dict[str, Sensor]
+    frames: tuple[Frame, ...]
+    region: Region
+    split: Split
+    unit: str = "input unit"
+    black_background: bool | None = None
+    problems: tuple[str, ...] = field(default=())
+
+    def frames_of(self, sensor: str, views: tuple[int, ...] | None = None) -> tuple[Frame, ...]:
+        """Frames of one sensor, optionally of some views only, in view order."""
+        return tuple(f for f in self.frames if f.sensor == sensor and (views is None or f.view in views))
