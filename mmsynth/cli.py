@@ -76,20 +76,24 @@ def _scene_path(text: str) -> Path:
 
 
 @contextmanager
-def _bar(title: str, total: float | None, quiet: bool) -> Iterator[Callable[..., None]]:
-    """A progress bar on stderr: the yielded function advances it by its first argument and shows the text of its second."""
+def _bar(title: str, quiet: bool) -> Iterator[Callable[..., None]]:
+    """A progress bar on stderr, for terminals: the yielded function is called with (done, total) and, if any, news to show."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(24), TextColumn("{task.percentage:3.0f}%"), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn(), TextColumn("{task.fields[news]}"))  # fmt: skip
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(24),
+        TextColumn("{task.percentage:3.0f}%"),
+        TimeElapsedColumn(),
+        TextColumn("eta"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[news]}"),
+    )
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, refresh_per_second=4) as progress:
-        task = progress.add_task(title, total=total, news="")
-
-        def advance(amount: float, news: str | None = None, total: float | None = None) -> None:
-            progress.update(task, advance=amount, total=total, **({} if news is None else {"news": news}))
-
-        yield advance
+        task = progress.add_task(title, total=None, news="")
+        yield lambda done, total, news="": progress.update(task, completed=done, total=total, news=news)
 
 
 def _load(run: Path | None) -> tuple[Path, Any, Any]:
@@ -127,6 +131,7 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.needs import Needs
     from mmsynth.fitting.recipe import load_recipe
     from mmsynth.fitting.trainer import Progress, pick_device
     from mmsynth.fitting.trainer import fit as fit_field
@@ -140,47 +145,50 @@ def fit(
     loaded = load_scene(_scene_path(scene), _names(modalities))
     name = loaded.root.resolve().name
     folder = run or (run_to_resume(name) if resume else new_run(name))
-    say = (lambda *_: None) if as_json else print
+
+    def say(text: str) -> None:
+        if not as_json:
+            print(text)
+
     for problem in loaded.problems:
         say(f"note: {problem}")
-    with _bar("fit", 1.0, as_json) as advance:
-        done = 0.0
+    with _bar("fit", as_json) as show:
 
         def on_step(news: Progress) -> None:
-            nonlocal done
-            if news.step % 5 == 0 or news.done >= 1.0:
-                psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
-                advance(news.done - done, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
-                done = news.done
+            psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
+            show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
+
+        def on_start(needs: Needs) -> None:
+            for what, why in needs.evidence.items():
+                say(f"needs {what}: {why}")
 
         field = fit_field(
-            loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume,
-            on_start=lambda needs: [say(f"needs {k}: {v}") for k, v in needs.evidence.items()] and None, on_step=on_step,
-        )  # fmt: skip
-    write_report(folder, field, loaded)
+            loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume, on_start=on_start, on_step=on_step
+        )
+    write_report(folder, field, scene=loaded)
     mark_latest(folder)
-    manifest = field.manifest
-    psnr = {n: round(v, 2) for n, v in manifest["train_psnr"].items()}
+    facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
     if as_json:
-        print(json.dumps({"run": str(folder), "steps": manifest["steps"], "seconds": manifest["seconds"], "train_psnr": psnr, "rays_per_s": manifest["rays_per_s"], "samples_per_s": manifest["samples_per_s"]}))  # fmt: skip
-    else:
-        shown = ", ".join(f"{n} {v:.1f}" for n, v in psnr.items())
-        print(f"{manifest['steps']} steps in {manifest['seconds']['fit']:.0f} s, {manifest['rays_per_s']:,.0f} rays/s; PSNR on training pixels [dB]: {shown}")
-        print(f"wrote {folder}/ (field.safetensors, manifest.json, preview.png, report.html)")
+        print(json.dumps(facts))
+        return
+    shown = ", ".join(f"{n} {v:.1f}" for n, v in facts["train_psnr"].items())
+    print(f"{facts['steps']} steps in {facts['seconds']['fit']:.0f} s, {facts['rays_per_s']:,.0f} rays/s")
+    print(f"PSNR on training pixels [dB]: {shown}")
+    print(f"wrote {folder}/ (field.safetensors, manifest.json, preview.png, report.html)")
 
 
 @command("evaluate")
 def evaluate(run: RunOption = None, as_json: JsonOption = False) -> None:
     """Score the test views."""
     from mmsynth.operations.evaluate import evaluate as score
-    from mmsynth.operations.evaluate import render_text
     from mmsynth.report.report import write_report
+    from mmsynth.report.text import score_text
 
     folder, field, scene = _load(run)
-    with _bar("evaluate", None, as_json) as advance:
-        scores = score(field, scene, progress=lambda rays: advance(rays))
-    write_report(folder, field, scene, scores)
-    print(json.dumps(scores) if as_json else render_text(scores))
+    with _bar("evaluate", as_json) as show:
+        scores = score(field, scene, progress=show)
+    write_report(folder, field, scores, scene=scene)
+    print(json.dumps(scores) if as_json else score_text(scores))
 
 
 @command("convert")
@@ -199,16 +207,20 @@ def convert(
     (a,), (b,) = _names(source) or [""], _names(target) or [""]
     chosen = _views(views)
     destination = out or folder / "convert" / f"{a}_to_{b}"
-    with _bar(f"{a} to {b}", None, as_json) as advance:
-        written = convert_frames(field, scene, a, b, destination, chosen, progress=lambda rays: advance(rays))
+    with _bar(f"{a} to {b}", as_json) as show:
+        written = convert_frames(field, scene, a, b, destination, chosen, progress=show)
     _tell(destination, written, as_json)
 
 
 @command("generate-dataset")
 def generate_dataset(
-    poses: Annotated[Path, typer.Option(help="transforms.json, camera_path.json, COLMAP images.txt or a trajectory; looked for here, then in the scene")],
+    poses: Annotated[
+        Path, typer.Option(help="transforms.json, camera_path.json, COLMAP images.txt or a trajectory; looked for here, then in the scene")
+    ],
     run: RunOption = None,
-    rig: Annotated[str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")] = "aligned",
+    rig: Annotated[
+        str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")
+    ] = "aligned",
     modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
     out: Annotated[Path | None, typer.Option(help="default: RUN/dataset")] = None,
     file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
@@ -229,9 +241,9 @@ def generate_dataset(
         return
     path = poses if poses.exists() or poses.is_absolute() else scene.root / poses
     views = load_views(path if path.exists() else poses, field, scene)
-    with _bar("dataset", len(views), as_json) as advance:
-        written = dataset.generate_dataset(field, views, destination, _names(modalities), rig, file_format, progress=lambda n: advance(n))
-    _tell(destination, written, as_json)
+    with _bar("dataset", as_json) as show:
+        written = dataset.generate_dataset(field, views, destination, _names(modalities), rig, file_format, progress=show)
+    print(json.dumps({"dataset": str(written), "views": len(views)}) if as_json else f"wrote {len(views)} views into {destination}/")
 
 
 @command("mesh")
@@ -246,11 +258,14 @@ def mesh(
 
     folder, field, _ = _load(run)
     destination = out or folder / "mesh.ply"
-    with _bar("mesh", None, as_json) as advance:
-        surface = extract_mesh(field, resolution, progress=lambda n: advance(n))
+    with _bar("mesh", as_json) as show:
+        surface = extract_mesh(field, resolution, progress=show)
     write_mesh(surface, destination, field.unit)
-    facts = {"out": str(destination), "vertices": len(surface.vertices), "faces": len(surface.faces), "bounds": surface.bounds.tolist(), "unit": field.unit}
-    print(json.dumps(facts) if as_json else f"wrote {destination}: {len(surface.vertices):,} vertices, {len(surface.faces):,} faces, in {field.unit}")
+    counts = {"vertices": len(surface.vertices), "faces": len(surface.faces)}
+    if as_json:
+        print(json.dumps({"out": str(destination), **counts, "bounds": surface.bounds.tolist(), "unit": field.unit}))
+    else:
+        print(f"wrote {destination}: {counts['vertices']:,} vertices, {counts['faces']:,} faces, in {field.unit}")
 
 
 @command("doctor")

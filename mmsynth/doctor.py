@@ -11,12 +11,24 @@ import torch
 
 from mmsynth.field.kernels import cpu
 
-_PACKAGES = ("mmsynth", "torch", "numba", "numpy", "kornia", "opencv-contrib-python-headless", "scikit-image", "trimesh", "pymeshlab", "triton", "mitsuba")
+_PACKAGES = (
+    "mmsynth",
+    "torch",
+    "numba",
+    "numpy",
+    "kornia",
+    "opencv-contrib-python-headless",
+    "scikit-image",
+    "trimesh",
+    "pymeshlab",
+    "triton",
+    "mitsuba",
+)
 
 
 def diagnose() -> dict[str, Any]:
     """Facts as one JSON-serialisable dict; ``advice`` holds one sentence per thing worth doing."""
-    versions = {}
+    versions: dict[str, str | None] = {}
     for name in _PACKAGES:
         try:
             versions[name] = importlib.metadata.version(name)
@@ -32,7 +44,15 @@ def diagnose() -> dict[str, Any]:
         advice.append(f"torch uses {torch.get_num_threads()} threads on {cores} cores: set OMP_NUM_THREADS={cores}.")
     if gpu:
         advice.append("With --device cuda the field runs on torch operations; the kernels compiled for speed are the CPU's.")
-    return {"python": platform.python_version(), "versions": versions, "cores": cores, "threads": torch.get_num_threads(), "gpu": gpu, "kernels_compiled": compiled, "advice": advice}  # fmt: skip
+    return {
+        "python": platform.python_version(),
+        "versions": versions,
+        "cores": cores,
+        "threads": torch.get_num_threads(),
+        "gpu": gpu,
+        "kernels_compiled": compiled,
+        "advice": advice,
+    }
 
 
 def render_text(facts: dict[str, Any]) -> str:

@@ -12,23 +12,27 @@ class HashGrid(nn.Module):
     """Multiresolution hash grid over the cube [-extent, extent]³ (Müller et al. 2022), 2 features per level.
 
     Args:
-        levels: number of levels. rows_log2: log2 of the rows per level.
+        levels: number of levels. rows_log2: log2 of the most rows a level may have; coarse levels take what they need.
         coarsest, finest: cells per axis of the first and the last level; geometric in between.
     """
 
     resolutions: Tensor
+    offsets: Tensor
 
     def __init__(self, levels: int, rows_log2: int, coarsest: int, finest: int, extent: float = 1.0) -> None:
         super().__init__()
         growth = (max(finest, coarsest) / coarsest) ** (1.0 / max(levels - 1, 1))
-        self.register_buffer("resolutions", torch.tensor([int(coarsest * growth**i + 0.5) for i in range(levels)]), persistent=False)
-        self.tables = nn.Parameter(torch.empty(levels, 2**rows_log2, 2).uniform_(-1e-4, 1e-4))
+        resolutions = [int(coarsest * growth**i + 0.5) for i in range(levels)]
+        rows = [min((r + 1) ** 3, 2**rows_log2) for r in resolutions]
+        self.register_buffer("resolutions", torch.tensor(resolutions), persistent=False)
+        self.register_buffer("offsets", torch.tensor([sum(rows[:i]) for i in range(levels + 1)]), persistent=False)
+        self.table = nn.Parameter(torch.empty(sum(rows), 2).uniform_(-1e-4, 1e-4))
         self.extent = extent
 
     @property
     def width(self) -> int:
         """Numbers per position."""
-        return 2 * self.tables.shape[0]
+        return 2 * len(self.resolutions)
 
     def cell(self, active: int) -> float:
         """Cell size of the finest active level."""
@@ -37,7 +41,7 @@ class HashGrid(nn.Module):
     def forward(self, positions: Tensor, active: int) -> Tensor:
         """(N, 3) → (N, width); levels from ``active`` on are zero and cost nothing."""
         unit = (positions * (0.5 / self.extent) + 0.5).clamp(0.0, 1.0)
-        return kernels.hash_encode(unit, self.tables, self.resolutions, active)
+        return kernels.hash_encode(unit, self.table, self.resolutions, self.offsets, active)
 
 
 def spherical_harmonics(d: Tensor) -> Tensor:

@@ -102,7 +102,9 @@ class Field(nn.Module):
         self.sensors, self.levels, self.region, self.unit = sensors, levels, region, unit
         self.cameras, self.rig = cameras or {}, rig or {}
         self.manifest: dict[str, Any] = {}
-        self.surface = Surface(HashGrid(d.surface_levels, d.surface_rows_log2, d.coarsest, d.surface_finest), d.surface_hidden, d.initial_radius)
+        self.surface = Surface(
+            HashGrid(d.surface_levels, d.surface_rows_log2, d.coarsest, d.surface_finest), d.surface_hidden, d.initial_radius
+        )
         self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest)
         self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, levels)
         self.background: Background | None = None
@@ -133,7 +135,7 @@ class Field(nn.Module):
         self, hits: rendering.Hits, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling
     ) -> Callable[[str, Tensor | None, slice], Tensor]:
         """Shade rays once; the result gives the values of any modality for any slice of them (axes as in ``Shader.values``)."""
-        front = self.shader.hidden(hits.features, directions)
+        front = self.shader.hidden(hits.features, directions, sampling.view_dependence)
         background = self.background
         behind = torch.nonzero(hits.opacity.detach() < 0.995)[:, 0] if background is not None else None
         position = hidden = None

@@ -24,7 +24,9 @@ class Occupancy(nn.Module):
         self.register_buffer("states", torch.full((resolution,) * 3, SHELL, dtype=torch.uint8))
 
     @torch.no_grad()
-    def update(self, sdf: Callable[[Tensor], Tensor], sharpness: float, generator: torch.Generator, share: float, slack: float = 1.5) -> bool:
+    def update(
+        self, sdf: Callable[[Tensor], Tensor], sharpness: float, generator: torch.Generator, share: float, slack: float = 1.5
+    ) -> bool:
         """Classify all shell cells and a random ``share`` of the others anew.
 
         Args:

@@ -25,9 +25,9 @@ class Shader(nn.Module):
         self.heads = nn.ModuleDict({n: nn.Linear(hidden, 6 if s.is_polarization else s.channel_count) for n, s in sensors.items()})
         self.levels = levels
 
-    def hidden(self, features: Tensor, directions: Tensor) -> Tensor:
+    def hidden(self, features: Tensor, directions: Tensor, view_dependence: float = 1.0) -> Tensor:
         """(R, F), (R, 3) → (R, H), shared by all modalities."""
-        return self.trunk(torch.cat([features, spherical_harmonics(directions)], -1))
+        return self.trunk(torch.cat([features, view_dependence * spherical_harmonics(directions)], -1))
 
     def values(self, modality: str, hidden: Tensor, axes: Tensor | None = None) -> Tensor:
         """Channel values of one modality, linear and ≥ 0.

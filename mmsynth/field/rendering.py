@@ -21,7 +21,10 @@ _SIGNIFICANT = 1e-3  # sections below this weight are not given a colour: at mos
 
 @dataclass(frozen=True)
 class Sampling:
-    """How finely a ray is seen: sharpness s of the surface, step between samples, active grid levels."""
+    """How finely a ray is seen: sharpness s of the surface, step between samples, active grid levels.
+
+    ``view_dependence`` scales what the shader sees of the direction: 0 = radiance is the same in all directions.
+    """
 
     sharpness: float
     step: float
@@ -29,6 +32,7 @@ class Sampling:
     active_radiance: int
     active_background: int
     background_samples: int = 16
+    view_dependence: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -81,16 +85,14 @@ def trace(
     return Hits(features, opacity, positions, t, ray, offsets, weights, crossing)
 
 
-def background_hidden(
-    background: Background, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling
-) -> Tensor:
+def background_hidden(background: Background, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling) -> Tensor:
     """Hidden layer of the background's shader, (R, H), for rays that see past the region of interest."""
     near, far = ball_interval(origins, directions)
     distance = torch.linalg.vector_norm(origins, dim=-1)
     # rays that miss the ball see everything from half-way to it on
     start = torch.where(far > near, far, 0.5 * distance).clamp(min=1e-2)
     features = background(origins, directions, start, jitter, sampling.background_samples, sampling.active_background)
-    return background.shader.hidden(features, directions)
+    return background.shader.hidden(features, directions, sampling.view_dependence)
 
 
 def median_depth(hits: Hits, rays: int) -> Tensor:

@@ -63,9 +63,7 @@ class Measurements:
                 raise InputError(f"{sensor.name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
         self.counts = np.array([_count(self.usable[c], self.directions[c]) for c in self.camera_index])
         self.ends = np.cumsum(self.counts)
-        self.channels = [
-            None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras
-        ]
+        self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
         self.level = float(np.mean([_decode(v).mean() for v in values]))
         self.has_alpha = any(a is not None for a in alphas)
 

@@ -6,6 +6,7 @@ without a polarization sensor (heads follow the sensors), no grid level finer th
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -48,19 +49,21 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     else:
         background = bright > 0.05
         verdict = "on" if background else "off"
-        evidence["background"] = f"{verdict}: {outside:.1%} of {rays} sampled pixels see past the region of interest, {bright:.1%} of these are not black"
+        past = f"{outside:.1%} of {rays} sampled pixels see past the region of interest"
+        evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black"
     # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
     surface_finest = int(np.clip(recipe.surface_cells / footprint, 32, 1024))
     radiance_finest = int(np.clip(recipe.radiance_cells / footprint, 64, 2048))
-    evidence["resolution"] = f"a pixel is {footprint:.2g} radii at the centre: finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
+    cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
+    evidence["resolution"] = f"a pixel is {footprint:.2g} radii at the centre: {cells}"
     pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
     evidence["tensor_head"] = f"on: {', '.join(pol)}" if pol else "off: no polarization sensor"
     design = Design(
         surface_levels=recipe.surface_levels,
-        surface_rows_log2=recipe.surface_rows_log2,
+        surface_rows_log2=_rows_log2(surface_finest, recipe.surface_rows_log2),
         surface_finest=surface_finest,
         radiance_levels=recipe.radiance_levels,
-        radiance_rows_log2=recipe.radiance_rows_log2,
+        radiance_rows_log2=_rows_log2(radiance_finest, recipe.radiance_rows_log2),
         radiance_finest=radiance_finest,
         background=background,
         background_finest=int(np.clip(2.0 / footprint, 64, 512)),
@@ -71,6 +74,11 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     )
     black = not background and outside >= 0.005
     return Needs(design, footprint, max(recipe.sharpness_end / footprint, 2 * recipe.sharpness_start), black, evidence)
+
+
+def _rows_log2(finest: int, most: int) -> int:
+    """Rows for the cells that a surface can occupy: about six faces' worth of the finest level, at most 2^most."""
+    return min(most, math.ceil(math.log2(6 * finest**2)))
 
 
 def _footprint(measurements: dict[str, Measurements]) -> float:

@@ -36,6 +36,7 @@ class Recipe(BaseModel):
     sharpness_end: float = Field(4.0, gt=0, description="at the end, in units of 1 / pixel footprint")
     sharpness_until: float = Field(0.6, gt=0, le=1, description="progress at which the sharpness reaches its end")
     levels_until: float = Field(0.4, gt=0, le=1, description="progress at which all levels of the grids are active")
+    view_dependence_from: float = Field(0.0, ge=0, le=1, description="progress before which radiance has no direction")
     learning_rate_grid: float = Field(1e-2, gt=0)
     learning_rate_network: float = Field(3e-3, gt=0)
     learning_rate_end: float = Field(0.05, gt=0, le=1, description="factor at the end")
@@ -52,7 +53,7 @@ def load_recipe(name_or_path: str | None) -> Recipe:
         InputError: no such recipe, broken TOML, an unknown key, or a value out of range.
     """
     if name_or_path is None:
-        return Recipe()  # type: ignore[call-arg]
+        return Recipe.model_validate({})
     path = Path(name_or_path)
     if not path.suffix:
         folder = data_folder("recipes")
@@ -61,7 +62,7 @@ def load_recipe(name_or_path: str | None) -> Recipe:
             known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
             raise InputError(f"recipe {name_or_path!r}: not found, expected one of {known} or a TOML file.")
     try:
-        return Recipe(**tomllib.loads(path.read_text(encoding="utf-8")))
+        return Recipe.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror}).") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

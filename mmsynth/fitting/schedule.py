@@ -17,7 +17,7 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
 
     def active(levels: int) -> int:
         first = min(4, levels)
-        return first + int(round(opened * (levels - first)))
+        return first + round(opened * (levels - first))
 
     design = needs.design
     return Sampling(
@@ -28,6 +28,8 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
         active_radiance=active(design.radiance_levels),
         active_background=active(design.background_levels),
         background_samples=recipe.background_samples,
+        # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
+        view_dependence=1.0 if progress >= recipe.view_dependence_from else 0.0,
     )
 
 

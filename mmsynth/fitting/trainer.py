@@ -26,7 +26,7 @@ from mmsynth.fitting import losses
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
 from mmsynth.fitting.measurements import Batch, Measurements, load_measurements
 from mmsynth.fitting.needs import Needs, assess
-from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
 from mmsynth.scene.scene import Scene
 
@@ -78,8 +78,8 @@ class Trainer:
         levels = {n: m.level for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
         self.field = Field(self.needs.design, sensors, levels, scene.region, scene.unit, cameras, rig_of(scene)).to(self.device)
-        grids = [p for n, p in self.field.named_parameters() if n.endswith("tables")]
-        networks = [p for n, p in self.field.named_parameters() if not n.endswith("tables")]
+        grids = [p for n, p in self.field.named_parameters() if n.endswith(".table")]
+        networks = [p for n, p in self.field.named_parameters() if not n.endswith(".table")]
         self.optimiser = torch.optim.Adam(
             [{"params": grids, "base": recipe.learning_rate_grid}, {"params": networks, "base": recipe.learning_rate_network}],
             betas=(0.9, 0.99),
@@ -105,7 +105,7 @@ class Trainer:
         sampling = sampling_at(self.progress, recipe, self.needs)
         if state.step % recipe.occupancy_every == 0:
             share = 1.0 if state.step == 0 else 1 / 16
-            sdf = lambda x: field.surface(x, sampling.active_surface)  # noqa: E731
+            sdf = lambda x: field.surface(x, sampling.active_surface)
             if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
                 state.reopened += 1
         per_modality = max(1, state.rays // len(self.measurements))
@@ -209,7 +209,9 @@ class Trainer:
         ours, theirs = self.task(), saved["task"]
         for key, value in ours.items():
             if theirs.get(key) != value:
-                raise InputError(f"checkpoint: was made with {key} {theirs.get(key)}, this fit has {value}; give another --run or the same options.")
+                raise InputError(
+                    f"checkpoint: was made with {key} {theirs.get(key)}, this fit has {value}; give another --run or the same options."
+                )
         self.field.load_state_dict(saved["field"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.state = _State(**saved["state"])
@@ -283,7 +285,7 @@ def fit(
     if steps is None and budget is None:
         budget = 60.0
     kernels.announce_compilation()
-    trainer = Trainer(scene, recipe or Recipe(), steps, budget, seed, device)  # type: ignore[call-arg]
+    trainer = Trainer(scene, recipe or load_recipe(None), steps, budget, seed, device)
     saved = read_checkpoint(run) if resume else None
     log: list[str] = []
     if saved is not None:
@@ -324,10 +326,17 @@ def fit(
 def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
     field, news = trainer.field, trainer.report()
     field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
-    field.occupancy.update(lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0)
+    field.occupancy.update(
+        lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
+    )
     field.manifest = {
         "mmsynth": mmsynth.__version__,
-        "scene": {"path": str(scene.root.resolve()), "format": scene.format, "hash": trainer.task()["scene"], "test_views": list(scene.split.test)},
+        "scene": {
+            "path": str(scene.root.resolve()),
+            "format": scene.format,
+            "hash": trainer.task()["scene"],
+            "test_views": list(scene.split.test),
+        },
         "recipe": trainer.recipe.model_dump(),
         "needs": trainer.needs.to_json(),
         "seed": trainer.seed,

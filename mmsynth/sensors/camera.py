@@ -36,12 +36,16 @@ class Camera:
 
     def __post_init__(self) -> None:
         if len(self.distortion) not in (0, 4, 5, 6, 8):
-            raise InputError(f"distortion: {len(self.distortion)} coefficients, expected 0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6.")
+            raise InputError(
+                f"distortion: {len(self.distortion)} coefficients, expected 0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6."
+            )
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: size {self.width}x{self.height}, expected at least 1x1 pixel.")
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
-            raise InputError(f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}, expected finite numbers and positive focal lengths.")
+            raise InputError(
+                f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}, expected finite numbers and positive focal lengths."
+            )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -109,7 +113,7 @@ def undistort(xy_distorted: np.ndarray, coefficients: np.ndarray, tolerance: flo
     """
     target = np.asarray(xy_distorted, dtype=np.float64)
     if not np.any(coefficients):
-        return target.copy(), np.isfinite(target).all(-1)
+        return target.copy(), np.asarray(np.isfinite(target).all(-1))
     limit = min(fold_radius(tuple(coefficients)), np.tan(np.radians(80.0)))
     radii = np.linspace(0.0, limit, 4097)
     profile = radii * _radial(coefficients, radii * radii)[0]

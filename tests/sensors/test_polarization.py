@@ -53,7 +53,9 @@ def test_coherency_is_physical_for_any_factor_and_frame() -> None:
     torch.manual_seed(0)
     factor = coherency_from_factor(torch.randn(200, 6) * 3)
     directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
-    axes = analyser_axes(directions, torch.nn.functional.normalize(torch.randn(200, 3), dim=1), torch.deg2rad(torch.tensor([ANGLES]).expand(200, 4)))
+    axes = analyser_axes(
+        directions, torch.nn.functional.normalize(torch.randn(200, 3), dim=1), torch.deg2rad(torch.tensor([ANGLES]).expand(200, 4))
+    )
     intensities = (axes @ factor).square().sum(-1).double().numpy()
     assert intensities.min() >= 0
     assert degree_of_linear_polarization(intensities_to_stokes(intensities, ANGLES)).max() <= 1 + 1e-6

@@ -17,10 +17,10 @@ def _on_cpu(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and tensor.dtype == torch.float32
 
 
-def hash_encode(positions: Tensor, tables: Tensor, resolutions: Tensor, active: int) -> Tensor:
+def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
     """Multiresolution hash encoding; see ``reference.hash_encode``."""
-    backend = cpu if _on_cpu(tables) and tables.shape[2] == 2 else reference
-    return backend.hash_encode(positions, tables, resolutions, active)
+    backend = cpu if _on_cpu(table) and table.shape[1] == 2 else reference
+    return backend.hash_encode(positions, table, resolutions, offsets, active)
 
 
 def march(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import torch
 from numba import njit, prange
@@ -47,7 +46,16 @@ def _corners(x, y, z, resolution, mask, dense):  # type: ignore[no-untyped-def]
     z0 = np.uint32(z) * _P2
     z1 = z0 + _P2
     a, b, c, d = x0 ^ y0, x0 ^ y1, x1 ^ y0, x1 ^ y1
-    return (a ^ z0) & mask, (a ^ z1) & mask, (b ^ z0) & mask, (b ^ z1) & mask, (c ^ z0) & mask, (c ^ z1) & mask, (d ^ z0) & mask, (d ^ z1) & mask
+    return (
+        (a ^ z0) & mask,
+        (a ^ z1) & mask,
+        (b ^ z0) & mask,
+        (b ^ z1) & mask,
+        (c ^ z0) & mask,
+        (c ^ z1) & mask,
+        (d ^ z0) & mask,
+        (d ^ z1) & mask,
+    )
 
 
 @njit(cache=True, inline="always")
@@ -59,16 +67,16 @@ def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _encode(positions, tables, resolutions, active, out):  # type: ignore[no-untyped-def]
+def _encode(positions, tables, resolutions, offsets, active, out):  # type: ignore[no-untyped-def]
     count = positions.shape[0]
-    rows = tables.shape[1]
-    mask = np.uint32(rows - 1)
     chunks = (count + _CHUNK - 1) // _CHUNK
     for chunk in prange(chunks):
         for level in range(active):
             resolution = np.int32(resolutions[level])
+            rows = offsets[level + 1] - offsets[level]
             dense = (np.int64(resolution) + 1) ** 3 <= rows
-            table = tables[level]
+            mask = np.uint32(rows - 1)
+            table = tables[offsets[level] : offsets[level + 1]]
             for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
                 x, y, z, fx, fy, fz = _cell(positions, i, resolution)
                 i0, i1, i2, i3, i4, i5, i6, i7 = _corners(x, y, z, resolution, mask, dense)
@@ -90,14 +98,14 @@ def _add(table, row, weight, a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _encode_backward(positions, gradient, resolutions, active, out):  # type: ignore[no-untyped-def]
+def _encode_backward(positions, gradient, resolutions, offsets, active, out):  # type: ignore[no-untyped-def]
     count = positions.shape[0]
-    rows = out.shape[1]
-    mask = np.uint32(rows - 1)
     for level in prange(active):
         resolution = np.int32(resolutions[level])
+        rows = offsets[level + 1] - offsets[level]
         dense = (np.int64(resolution) + 1) ** 3 <= rows
-        table = out[level]
+        mask = np.uint32(rows - 1)
+        table = out[offsets[level] : offsets[level + 1]]
         for i in range(count):
             a = gradient[i, 2 * level]
             b = gradient[i, 2 * level + 1]
@@ -227,21 +235,23 @@ def _sections_backward(sdf, sharpness, offsets, gradient, out):  # type: ignore[
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, tables, resolutions, active):  # type: ignore[no-untyped-def]
-        count = positions.shape[0]
-        out = torch.zeros(count, tables.shape[0] * 2)
-        active = min(active, tables.shape[0])
-        _encode(positions.detach().numpy(), tables.detach().numpy(), resolutions.numpy(), active, out.numpy())
-        ctx.save_for_backward(positions, resolutions)
-        ctx.shape, ctx.active = tables.shape, active
+    def forward(ctx, positions, table, resolutions, offsets, active):  # type: ignore[no-untyped-def]
+        levels = resolutions.shape[0]
+        ctx.active = min(active, levels)
+        out = torch.empty(positions.shape[0], 2 * levels)
+        out[:, 2 * ctx.active :] = 0.0
+        _encode(positions.detach().numpy(), table.detach().numpy(), resolutions.numpy(), offsets.numpy(), ctx.active, out.numpy())
+        ctx.save_for_backward(positions, resolutions, offsets)
+        ctx.rows = table.shape[0]
         return out
 
     @staticmethod
     def backward(ctx, gradient):  # type: ignore[no-untyped-def]
-        positions, resolutions = ctx.saved_tensors
-        out = torch.zeros(ctx.shape)
-        _encode_backward(positions.detach().numpy(), gradient.contiguous().numpy(), resolutions.numpy(), ctx.active, out.numpy())
-        return None, out, None, None
+        positions, resolutions, offsets = ctx.saved_tensors
+        out = torch.zeros(ctx.rows, 2)
+        arrays = (x.numpy() for x in (positions.detach(), gradient.contiguous(), resolutions, offsets))
+        _encode_backward(*arrays, ctx.active, out.numpy())  # type: ignore[call-arg]
+        return None, out, None, None, None
 
 
 class _SectionWeights(torch.autograd.Function):
@@ -262,9 +272,9 @@ class _SectionWeights(torch.autograd.Function):
         return out, None, None
 
 
-def hash_encode(positions: Tensor, tables: Tensor, resolutions: Tensor, active: int) -> Tensor:
-    """See ``reference.hash_encode``; float32, F = 2, differentiable in ``tables`` alone."""
-    return _HashEncode.apply(positions.contiguous(), tables, resolutions, active)
+def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
+    """See ``reference.hash_encode``; float32, F = 2, differentiable in ``table`` alone."""
+    return _HashEncode.apply(positions.contiguous(), table, resolutions, offsets, active)
 
 
 def march(
@@ -274,11 +284,11 @@ def march(
     rays = origins.shape[0]
     arrays = [x.contiguous().numpy() for x in (origins, directions, near, far, jitter, states)]
     counts = np.empty(rays, np.int64)
-    _march_count(*arrays, np.float32(step), counts)
+    _march_count(*arrays, np.float32(step), counts)  # type: ignore[call-arg]
     offsets = np.zeros(rays + 1, np.int64)
     np.cumsum(counts, out=offsets[1:])
     t, ray = np.empty(offsets[-1], np.float32), np.empty(offsets[-1], np.int64)
-    _march_fill(*arrays, np.float32(step), offsets, t, ray)
+    _march_fill(*arrays, np.float32(step), offsets, t, ray)  # type: ignore[call-arg]
     return torch.from_numpy(t), torch.from_numpy(ray), torch.from_numpy(offsets)
 
 
@@ -301,14 +311,9 @@ def _cached(kernel) -> bool:  # type: ignore[no-untyped-def]
 
 def compile_all() -> None:
     """Run every kernel once on a tiny input, so that compilation happens here and not within a timed loop."""
-    tables = torch.zeros(2, 64, 2, requires_grad=True)
-    hash_encode(torch.rand(4, 3), tables, torch.tensor([2, 5]), 2).sum().backward()
+    table = torch.zeros(91, 2, requires_grad=True)
+    hash_encode(torch.rand(4, 3), table, torch.tensor([2, 5]), torch.tensor([0, 27, 91]), 2).sum().backward()
     ray = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.zeros(2), torch.ones(2), torch.rand(2)
     _, _, offsets = march(*ray, torch.ones(4, 4, 4, dtype=torch.uint8), 0.1)
     sdf = torch.linspace(1, -1, int(offsets[-1]), requires_grad=True)
     section_weights(sdf, 10.0, offsets)[0].sum().backward()
-
-
-def set_threads(count: int) -> None:
-    """Threads of the kernels; at most numba's own limit."""
-    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))

@@ -1,6 +1,6 @@
 """The operations in plain torch: the definition that the fast backends are tested against, on any device and dtype.
 
-Symbols: N samples, R rays, L levels, T table rows, F features per level. Samples are packed ray after ray;
+Symbols: N samples, R rays, L levels, T rows of all levels, F features per level. Samples are packed ray after ray;
 ``offsets`` (R + 1,) int64 delimits them. Section i runs from sample i to sample i + 1 of the same ray.
 """
 
@@ -14,31 +14,34 @@ PRIMES = (1, 2654435761, 805459861)
 OUTSIDE, SHELL, SOLID = 0, 1, 2
 
 
-def hash_encode(positions: Tensor, tables: Tensor, resolutions: Tensor, active: int) -> Tensor:
-    """Multiresolution hash encoding, trilinear (Müller et al. 2022, section 3), differentiable in ``tables``.
+def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
+    """Multiresolution hash encoding, trilinear (Müller et al. 2022, section 3), differentiable in ``table``.
+
+    A level whose (resolution + 1)³ corners fit its rows is stored densely, any other is hashed into a power of two of rows.
 
     Args:
-        positions: (N, 3) in [0, 1]. tables: (L, T, F), T a power of two. resolutions: (L,) int64, cells per axis.
+        positions: (N, 3) in [0, 1]. table: (T, F), the rows of all levels. resolutions: (L,) int64, cells per axis.
+        offsets: (L + 1,) int64, the rows of each level.
         active: levels above it are skipped and give zeros.
     Returns:
         (N, L F), level-major.
     """
-    levels, rows, features = tables.shape
-    out = torch.zeros(positions.shape[0], levels, features, dtype=tables.dtype, device=tables.device)
+    levels, features = resolutions.shape[0], table.shape[1]
+    out = torch.zeros(positions.shape[0], levels, features, dtype=table.dtype, device=table.device)
     corners = torch.tensor([[(c >> 2) & 1, (c >> 1) & 1, c & 1] for c in range(8)], device=positions.device)
     for level in range(min(active, levels)):
-        resolution = int(resolutions[level])
+        resolution, rows = int(resolutions[level]), table[offsets[level] : offsets[level + 1]]
         scaled = positions * resolution
         base = scaled.floor().clamp(0, resolution - 1)
         fraction = (scaled - base)[:, None]
         cell = base.long()[:, None] + corners
-        if (resolution + 1) ** 3 <= rows:
+        if (resolution + 1) ** 3 <= len(rows):
             index = (cell[..., 0] * (resolution + 1) + cell[..., 1]) * (resolution + 1) + cell[..., 2]
         else:
             index = (cell[..., 0] * PRIMES[0]) ^ (cell[..., 1] * PRIMES[1]) ^ (cell[..., 2] * PRIMES[2])
-            index = index & (rows - 1)
+            index = index & (len(rows) - 1)
         weight = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
-        out[:, level] = (tables[level][index] * weight[..., None]).sum(1)
+        out[:, level] = (rows[index] * weight[..., None]).sum(1)
     return out.reshape(positions.shape[0], levels * features)
 
 

@@ -1,0 +1,190 @@
+"""Sensor to sensor: what another sensor of the field would have seen at the pose, and on the pixels, of a given frame."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.files import write_json
+from mmsynth.operations import previews
+from mmsynth.operations.progress import Counter, Progress
+from mmsynth.operations.trajectories import View
+from mmsynth.scene.images import write_npz, write_png16
+from mmsynth.scene.scene import Scene, Sensor, canonical_modality
+from mmsynth.sensors.camera import Camera
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field, Rendering
+
+
+def wavelengths_array(sensor: Sensor) -> np.ndarray:
+    """(C,) float32 nm, NaN where a channel is broad or unknown."""
+    return np.array([np.nan if w is None else w for w in sensor.wavelengths_nm], np.float32)
+
+
+def camera_json(camera: Camera, camera_to_world: np.ndarray) -> dict[str, Any]:
+    """Intrinsics, lens and pose in the library's conventions, ready for JSON."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "distortion": list(camera.distortion),
+        "camera_to_world": np.asarray(camera_to_world, dtype=np.float64).tolist(),
+    }
+
+
+def sensor_json(sensor: Sensor) -> dict[str, Any]:
+    """Channel names, wavelengths and analyser angles of a sensor, ready for JSON."""
+    return {
+        "channels": list(sensor.channels),
+        "wavelengths_nm": list(sensor.wavelengths_nm),
+        "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
+    }
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def modality_arrays(sensor: Sensor, rendering: Rendering) -> dict[str, np.ndarray]:
+    """What a file of one modality holds: data (H, W, C), channels, wavelengths_nm (NaN = none) and, for polarization, stokes (H, W, 3)."""
+    arrays = {
+        "data": rendering.channels[sensor.name].astype(np.float32),
+        "channels": np.array(sensor.channels, dtype=np.str_),
+        "wavelengths_nm": wavelengths_array(sensor),
+    }
+    if sensor.is_polarization:
+        arrays["stokes"] = rendering.stokes[sensor.name].astype(np.float32)
+        arrays["polarizer_angles_deg"] = np.array(sensor.polarizer_angles_deg, np.float32)
+    return arrays
+
+
+def source_views(scene: Scene, source: str, views: Sequence[int] | None = None) -> list[View]:
+    """Camera, pose and name (view id, 4 digits) of all frames of a sensor, or of some views.
+
+    Raises:
+        InputError: unknown sensor or view id.
+    """
+    source = canonical_modality(source)
+    if source not in scene.sensors:
+        raise InputError(f"modality {source!r}: not in the scene {scene.root}, expected one of {', '.join(scene.sensors)}.")
+    frames = scene.frames_of(source)
+    if views is not None:
+        known = {frame.view for frame in frames}
+        missing = sorted(set(views) - known)
+        if missing:
+            raise InputError(f"view {missing[0]}: the scene has no frame of '{source}' with this id, expected some of {_ranges(known)}.")
+        frames = tuple(frame for frame in frames if frame.view in set(views))
+    return [(frame.camera, frame.camera_to_world, f"{frame.view:04d}") for frame in frames]
+
+
+def _ranges(ids: set[int]) -> str:
+    """{0, 1, 2, 5} → "0-2, 5"."""
+    runs: list[list[int]] = []
+    for i in sorted(ids):
+        if runs and i == runs[-1][1] + 1:
+            runs[-1][1] = i
+        else:
+            runs.append([i, i])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+
+
+def convert(
+    field: Field,
+    scene: Scene,
+    source: str,
+    target: str,
+    out: Path | str,
+    views: Sequence[int] | None = None,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Render modality ``target`` at the pose of every ``source`` frame, on its pixel grid (intrinsics and lens included).
+
+    Aligned by construction: no warp and no resampling. See ``convert_views`` for the files.
+
+    Args:
+        views: view ids; None: all frames of the source. progress: called with (rays done, rays in all).
+    Returns:
+        the files written, the sidecars included.
+    Raises:
+        InputError: unknown modality or view, or the disk refused.
+    """
+    # known before anything is rendered or written
+    field.check_modalities([canonical_modality(target)])
+    return convert_views(field, target, source_views(scene, source, views), out, progress, source=canonical_modality(source))
+
+
+def convert_views(
+    field: Field, target: str, views: Sequence[View], out: Path | str, progress: Progress | None = None, source: str | None = None
+) -> list[Path]:
+    """Render one modality at any views.
+
+    Per view, in ``<out>/<target>/``:
+
+    * ``NAME.npz``: data (H, W, C) float32, opacity, valid, channels, wavelengths_nm; polarization also stokes (H, W, 3) in this
+      camera's x-axis frame;
+    * ``NAME.png``: 16-bit preview, tone-mapped with one exposure for all views; for polarization S0, and ``NAME_dolp.png`` (grey)
+      and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``);
+    * ``NAME.json``: camera, conventions, hash; written last, so a view with a sidecar is complete.
+    """
+    target = canonical_modality(target)
+    field.check_modalities([target])
+    if not views:
+        raise InputError(f"convert to {target}: no views, expected at least one frame.")
+    sensor, folder = field.sensors[target], Path(out) / target
+    count = Counter(progress, sum(camera.width * camera.height for camera, _, _ in views))
+    written: list[Path] = []
+    exposure: float | None = None
+    for camera, pose, name in views:
+        before = count.done
+        rendering = field.render(camera, pose, [target], geometry=False, progress=count)
+        count(before + camera.width * camera.height - count.done)
+        sidecar = folder / f"{name}.json"
+        # a stale sidecar must not vouch for new files if this run is cut off
+        sidecar.unlink(missing_ok=True)
+        data = folder / f"{name}.npz"
+        write_npz(data, {**modality_arrays(sensor, rendering), "opacity": rendering.opacity, "valid": rendering.valid})
+        linear = previews.preview_linear(sensor, rendering.channels[target])
+        exposure = previews.exposure_of(linear) if exposure is None else exposure
+        pictures = {folder / f"{name}.png": previews.tone_map(linear, exposure)}
+        if sensor.is_polarization:
+            pictures[folder / f"{name}_dolp.png"] = previews.preview_dolp(rendering.stokes[target])
+            pictures[folder / f"{name}_aolp.png"] = previews.preview_aolp(rendering.stokes[target])
+        for path, picture in pictures.items():
+            write_png16(path, picture)
+        facts = {
+            "name": name,
+            "modality": target,
+            "from": source,
+            "sensor": sensor_json(sensor),
+            "camera": camera_json(camera, pose),
+            "conventions": CONVENTIONS,
+            "unit": field.unit,
+            "preview_exposure": exposure,
+            "data": {"file": data.name, "sha256": sha256_of(data)},
+        }
+        write_json(sidecar, facts)
+        written += [data, *pictures, sidecar]
+    return written
+
+
+CONVENTIONS = {
+    "camera_axes": "OpenCV: x right, y down, z forward; camera_to_world 4x4",
+    "pixels": "centre of the top-left pixel is (0, 0)",
+    "distortion": "OpenCV order k1 k2 p1 p2 k3 k4 k5 k6, undistorted to distorted; images are distorted, as the lens sees",
+    "radiance": "linear float32, 1.0 = full scale of the sensor; NaN where the lens has no ray",
+    "polarization": "S0 S1 S2 about the camera x axis; angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
+    "depth": "depth_z along the optical axis, depth_ray along the ray; NaN = no hit",
+    "normal": "world frame, unit, outward; NaN = no hit",
+    "world": "the scene's own frame and unit",
+}

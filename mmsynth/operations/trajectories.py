@@ -1,0 +1,191 @@
+"""Where to render from: poses files and generated camera paths.
+
+A view is ``(camera, camera_to_world, name)``: intrinsics with lens, (4, 4) float64 pose with OpenCV axes in the scene's world frame
+and unit, and a name. Generated paths turn around the region of interest and look at its centre; up is the training cameras' mean up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from mmsynth.errors import InputError
+from mmsynth.files import read_json
+from mmsynth.scene.poses import read_poses
+from mmsynth.scene.scene import Region, Scene
+from mmsynth.sensors.camera import Camera
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field
+
+View = tuple[Camera, np.ndarray, str]
+
+_KEYS: dict[str, dict[str, Any]] = {
+    "orbit": {"views": 60, "elevation_deg": 25.0, "radius": None},
+    "hemisphere": {"views": 60, "min_elevation_deg": 10.0, "radius": None},
+    "interpolate": {"views": 60},
+}
+
+
+def world_up(poses: Sequence[np.ndarray]) -> np.ndarray:
+    """Mean up (-y axis) of cameras, (3,) unit; where they cancel, the direction in which the cameras spread least, or z."""
+    up = -np.mean([pose[:3, 1] for pose in poses], axis=0) if len(poses) else np.zeros(3)
+    if np.linalg.norm(up) < 0.1:
+        centres = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
+        flat = len(centres) >= 3
+        up = np.linalg.svd(centres - centres.mean(0))[2][2] if flat else np.array([0.0, 0.0, 1.0])
+        up = up if up[np.abs(up).argmax()] > 0 else -up
+    return up / np.linalg.norm(up)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Camera at ``eye`` that looks at ``target`` with ``up`` upwards in its image: (4, 4), OpenCV axes.
+
+    Looking along ``up``, any roll will do; one is chosen.
+    """
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(forward, np.eye(3)[np.abs(up).argmin()])
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], 1)
+    return pose
+
+
+def _horizon(up: np.ndarray, centre: np.ndarray, poses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Two horizontal unit vectors; the first points from the centre to the first training camera."""
+    start = poses[0][:3, 3] - centre if len(poses) else np.zeros(3)
+    start = start - (start @ up) * up
+    if np.linalg.norm(start) < 1e-9:
+        axis = np.eye(3)[np.abs(up).argmin()]
+        start = axis - (axis @ up) * up
+    start = start / np.linalg.norm(start)
+    return start, np.cross(up, start)
+
+
+def _around(azimuth: np.ndarray, sine: np.ndarray, radius: float, region: Region, poses: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Poses on a sphere about the region's centre. azimuth [rad], sine of the elevation: (V,)."""
+    up, centre = world_up(poses), np.asarray(region.centre, dtype=np.float64)
+    first, second = _horizon(up, centre, poses)
+    flat = np.sqrt(np.clip(1.0 - sine**2, 0.0, None))
+    offset = (flat * np.cos(azimuth))[:, None] * first + (flat * np.sin(azimuth))[:, None] * second + sine[:, None] * up
+    return [look_at(centre + radius * o, centre, up) for o in offset]
+
+
+def _interpolate(views: int, poses: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Through all training poses in their order: rotations by SLERP, positions linear, equal time between neighbours."""
+    at = np.linspace(0.0, len(poses) - 1.0, views)
+    rotations = Slerp(np.arange(len(poses)), Rotation.from_matrix(np.array([p[:3, :3] for p in poses])))(at).as_matrix()
+    centres = np.array([p[:3, 3] for p in poses])
+    out = np.tile(np.eye(4), (views, 1, 1))
+    out[:, :3, :3] = rotations
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(at, np.arange(len(poses)), centres[:, axis])
+    return list(out)
+
+
+def _number(spec: Mapping[str, Any], key: str, default: float, low: float, high: float, where: str) -> float:
+    value = spec.get(key, default)
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value)
+    if not good or not low <= value <= high:
+        raise InputError(f"{where}: key '{key}' is {value!r}, expected a number from {low:g} to {high:g}.")
+    return float(value)
+
+
+def trajectory_views(
+    spec: Mapping[str, Any], region: Region, camera: Camera, training: Sequence[np.ndarray], where: str = "trajectory"
+) -> list[View]:
+    """A generated camera path.
+
+    * ``{"trajectory": "orbit", "views": 60, "elevation_deg": 25, "radius": r}``: a circle, starting at the first training camera's side;
+    * ``{"trajectory": "hemisphere", "views": 60, "min_elevation_deg": 10, "radius": r}``: a Fibonacci lattice, equal area per view;
+    * ``{"trajectory": "interpolate", "views": 60}``: through the training poses, rotations by SLERP.
+
+    Args:
+        camera: intrinsics of every view. training: (4, 4) poses; give up direction, and the radius (median distance) when none is stated.
+        where: what to name in errors.
+    Raises:
+        InputError: unknown trajectory or key, or a value out of range.
+    """
+    kind = spec.get("trajectory")
+    if not isinstance(kind, str) or kind not in _KEYS:
+        raise InputError(f"{where}: key 'trajectory' is {kind!r}, expected one of {', '.join(_KEYS)}.")
+    allowed = _KEYS[kind]
+    unknown = [key for key in spec if key != "trajectory" and key not in allowed]
+    if unknown:
+        raise InputError(f"{where}: unknown key '{unknown[0]}', expected one of {', '.join(allowed)} for '{kind}'.")
+    number = _number(spec, "views", allowed["views"], 1, 100_000, where)
+    if number != int(number):
+        raise InputError(f"{where}: key 'views' is {number}, expected a whole number.")
+    views = int(number)
+    if kind == "interpolate":
+        if len(training) < 2:
+            raise InputError(f"{where}: {len(training)} training poses, expected at least 2 to interpolate.")
+        poses = _interpolate(views, training)
+    else:
+        distances = [float(np.linalg.norm(pose[:3, 3] - region.centre)) for pose in training]
+        default = float(np.median(distances)) if distances and np.median(distances) > 0 else 3.0 * region.radius
+        radius = default if spec.get("radius") is None else _number(spec, "radius", default, 1e-9, 1e9, where)
+        if kind == "orbit":
+            elevation = np.radians(_number(spec, "elevation_deg", allowed["elevation_deg"], -90.0, 90.0, where))
+            azimuth = 2 * np.pi * np.arange(views) / views
+            poses = _around(azimuth, np.full(views, np.sin(elevation)), radius, region, training)
+        else:
+            lowest = np.sin(np.radians(_number(spec, "min_elevation_deg", allowed["min_elevation_deg"], -90.0, 89.0, where)))
+            steps = np.arange(views)
+            sine = lowest + (1.0 - lowest) * (steps + 0.5) / views
+            golden_angle = np.pi * (3.0 - np.sqrt(5.0))
+            poses = _around(golden_angle * steps, sine, radius, region, training)
+    return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
+
+
+def reference_camera(field: Field) -> Camera:
+    """Intrinsics of the field's first sensor that has any.
+
+    Raises:
+        InputError: the field stores no camera.
+    """
+    for name in field.sensors:
+        if name in field.cameras:
+            return field.cameras[name]
+    raise InputError("field: it stores no camera, expected poses with intrinsics.")
+
+
+def training_poses(scene: Scene) -> list[np.ndarray]:
+    """(4, 4) poses of the reference sensor's training views, in view order."""
+    for name in scene.sensors:
+        frames = scene.frames_of(name, scene.split.train)
+        if frames:
+            return [frame.camera_to_world for frame in frames]
+    return []
+
+
+def load_views(path: Path | str, field: Field, scene: Scene | None = None) -> list[View]:
+    """Read a poses file or a trajectory (JSON with the key 'trajectory'); in the scene's world frame and unit.
+
+    Poses without intrinsics take the reference camera of the field.
+
+    Args:
+        scene: needed for a trajectory only: its training poses say what is up and how far away to be.
+    Raises:
+        InputError: unreadable file, unknown layout, or bad value.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".json":
+        content = read_json(path)
+        if isinstance(content, dict) and "trajectory" in content:
+            training = training_poses(scene) if scene is not None else []
+            return trajectory_views(content, field.region, reference_camera(field), training, str(path))
+    poses = read_poses(path)
+    fallback = reference_camera(field) if any(camera is None for camera, _, _ in poses) else None
+    views: list[View] = []
+    for camera, pose, name in poses:
+        chosen = camera or fallback
+        assert chosen is not None
+        views.append((chosen, pose, name))
+    return views

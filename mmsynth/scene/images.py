@@ -1,0 +1,313 @@
+"""Image files in and out: linear values, 1.0 = full scale, nothing converted in secret.
+
+Values are taken as they are: a uint8 file is divided by 255 and a uint16 file by 65535 whatever the sensor's bit depth
+(12-bit data must be stored left-aligned), a float file is not scaled at all and may exceed 1. No gamma is removed: an
+8-bit sRGB photo stays gamma-encoded, and a field learned from it predicts gamma-encoded values.
+
+``cv2`` silently returns the readable part of a damaged file, so PNG chunks (with CRC) and JPEG markers are checked here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import tifffile
+
+from mmsynth.errors import InputError
+from mmsynth.files import write_atomic
+from mmsynth.scene.scene import Frame, Sensor
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".exr")
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read an image as linear float32, 1.0 = full scale.
+
+    Colour files come in RGB or RGBA order; EXR channels that are not R, G, B, A in natural order of their names
+    (2 before 10); an npz file holds the image under the key ``data``.
+
+    Args:
+        path: png, jpg, tif (uint8, uint16 or float), npy, npz (the same) or exr.
+    Returns:
+        (H, W) or (H, W, C) float32.
+    Raises:
+        InputError: missing, truncated or damaged file, unknown type, or NaN / infinity in a float file.
+    """
+    raw = read_native(path)
+    if raw.dtype.kind == "u":
+        return raw.astype(np.float32) / np.float32(np.iinfo(raw.dtype).max)
+    image = raw.astype(np.float32)
+    if not np.isfinite(image).all():
+        row, column = np.argwhere(~np.isfinite(image))[0][:2]
+        raise InputError(f"{path}: the pixel in row {row}, column {column} is not a finite number.")
+    return image
+
+
+def read_native(path: Path) -> np.ndarray:
+    """The pixels as the file stores them: (H, W) or (H, W, C) uint8, uint16 or float; errors as ``read_image``."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: unknown image type '{path.suffix}', expected one of {' '.join(SUFFIXES)}.")
+    if not path.is_file():
+        raise InputError(f"{path}: no such image file.")
+    try:
+        if suffix in (".png", ".jpg", ".jpeg"):
+            image = _read_photo(path)
+        elif suffix in (".tif", ".tiff"):
+            image = _read_tiff(path)
+        elif suffix == ".exr":
+            image = _read_exr(path)
+        else:
+            image = _read_numpy(path)
+    except InputError:
+        raise
+    except Exception as error:  # each library has its own zoo of exceptions for a damaged file
+        raise InputError(f"{path}: damaged or truncated image, could not be read ({_first_line(error)}).") from error
+    if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
+        raise InputError(f"{path}: pixels of type {image.dtype}, expected uint8, uint16 or float.")
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise InputError(f"{path}: array of shape {image.shape}, expected (height, width) or (height, width, channels).")
+    return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
+def check_file(path: Path) -> None:
+    """Check that a PNG or JPEG file is complete, without decoding it; other types are only checked to exist.
+
+    Raises:
+        InputError: missing, truncated or damaged.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such image file.")
+    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        _check_photo(path.read_bytes(), path)
+
+
+def load_frame(sensor: Sensor, frame: Frame) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read a frame and check it against its camera and sensor.
+
+    Returns:
+        pixels: (H, W) float32 for a mosaicked sensor (raw, never demosaicked), else (H, W, C), C = 1 for mono.
+        alpha: (H, W) float32 where the file has one channel more than a 1- or 3-channel sensor, else None. Colours are not
+            multiplied by it.
+    Raises:
+        InputError: unreadable file, or size or channel count other than expected.
+    """
+    image = read_image(frame.path)
+    expected = (frame.camera.height, frame.camera.width)
+    if image.shape[:2] != expected:
+        raise InputError(
+            f"{frame.path}: the image is {image.shape[1]}x{image.shape[0]} pixels, "
+            f"expected {expected[1]}x{expected[0]} as the camera of '{sensor.name}' says."
+        )
+    if sensor.mosaic is not None:
+        if image.ndim != 2:
+            raise InputError(f"{frame.path}: {image.shape[2]} channels, expected one: the frames of '{sensor.name}' are mosaicked.")
+        return image, None
+    image = image[..., None] if image.ndim == 2 else image
+    count = sensor.channel_count
+    if image.shape[2] == count:
+        return image, None
+    if count in (1, 3) and image.shape[2] == count + 1:
+        return np.ascontiguousarray(image[..., :count]), np.ascontiguousarray(image[..., count])
+    if count == 1 and image.shape[2] == 4 and np.array_equal(image[..., 0], image[..., 1]) and np.array_equal(image[..., 0], image[..., 2]):
+        return np.ascontiguousarray(image[..., :1]), np.ascontiguousarray(image[..., 3])  # cv2 expands grey + alpha to four channels
+    raise InputError(f"{frame.path}: {image.shape[2]} channels, expected {count} for '{sensor.name}'.")
+
+
+def used_bits(raw: np.ndarray) -> int:
+    """How many high bits of an unsigned integer image are in use: 12 for 12-bit data stored left-aligned in uint16.
+
+    Counted from the low bits that are zero in every pixel. An image too plain to tell (fewer than 8 bits in use) counts as full.
+    """
+    bits = raw.dtype.itemsize * 8
+    seen = int(np.bitwise_or.reduce(raw, axis=None))
+    empty = (seen & -seen).bit_length() - 1 if seen else 0
+    return bits - empty if bits - empty >= 8 else bits
+
+
+def saturation_level(raw: np.ndarray) -> float:
+    """From which value (1.0 = full scale) pixels of files like this one count as clipped.
+
+    0.998 of the highest code that its bits can hold: 65520/65535 for left-aligned 12-bit data, where the margin covers
+    the upper 9 of 4096 codes; in 8-bit files it is the code 255 alone. A float file has no full scale at which it clips: infinity.
+    """
+    if raw.dtype.kind == "f":
+        return float("inf")
+    bits = raw.dtype.itemsize * 8
+    empty = bits - used_bits(raw)
+    top = (1 << bits) - (1 << empty)
+    return 0.998 * top / ((1 << bits) - 1)
+
+
+def _read_photo(path: Path) -> np.ndarray:
+    data = path.read_bytes()
+    _check_photo(data, path)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(f"{path}: damaged image, could not be decoded.")
+    if image.ndim == 3 and image.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    if image.ndim == 3 and image.shape[2] == 4:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA))
+    return np.asarray(image)
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    """Samples stored in planes, and pages of one size, become channels: always (H, W) or (H, W, C)."""
+    with tifffile.TiffFile(path) as file:
+        size = path.stat().st_size
+        for page in file.pages:
+            if not isinstance(page, tifffile.TiffPage):
+                continue
+            if any(offset + count > size for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)):
+                raise InputError(f"{path}: truncated image, the file ends at byte {size} inside the pixels.")
+        series = file.series[0]
+        image = np.asarray(series.asarray())
+        return np.moveaxis(image, 0, -1) if image.ndim == 3 and series.axes[-1] == "X" else image
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings there, and --json promises nothing else
+        file = OpenEXR.File(str(path), separate_channels=True)
+    channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    colour = [name for name in ("R", "G", "B", "A") if name in channels]
+    names = colour if set(colour) == set(channels) else sorted(channels, key=_natural)
+    return np.stack([channels[name] for name in names], -1)
+
+
+def _read_numpy(path: Path) -> np.ndarray:
+    loaded = np.load(path, allow_pickle=False)
+    if isinstance(loaded, np.ndarray):
+        return loaded
+    with loaded:
+        if "data" not in loaded:
+            raise InputError(f"{path}: no array 'data', expected one of shape (height, width, channels).")
+        return np.asarray(loaded["data"])
+
+
+def _check_photo(data: bytes, path: Path) -> None:
+    """Dispatch by content: a JPEG named .png is still a JPEG."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        _check_png(data, path)
+    elif data[:2] == b"\xff\xd8":
+        _check_jpeg(data, path)
+    else:
+        raise InputError(f"{path}: damaged image, neither PNG nor JPEG data.")
+
+
+def _check_png(data: bytes, path: Path) -> None:
+    """Walk the chunks down to IEND and check each CRC."""
+    view = memoryview(data)
+    position = 8
+    while position + 12 <= len(view):
+        length, kind = struct.unpack_from(">I4s", view, position)
+        end = position + 12 + length
+        if end > len(view):
+            break
+        (crc,) = struct.unpack_from(">I", view, end - 4)
+        if zlib.crc32(view[position + 4 : end - 4]) != crc:
+            raise InputError(f"{path}: damaged PNG, the checksum of the chunk at byte {position} is wrong.")
+        if kind == b"IEND":
+            return
+        position = end
+    raise InputError(f"{path}: truncated PNG, the file ends at byte {len(view)} before its end marker (IEND).")
+
+
+# in entropy-coded data every 0xFF is followed by 0x00 (stuffing), a restart marker or another 0xFF (fill)
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+
+
+def _check_jpeg(data: bytes, path: Path) -> None:
+    """Walk the segments down to EOI: searching for EOI alone would find the one of an embedded thumbnail."""
+    position = 2
+    while position + 2 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xD9:
+            return
+        if marker == 0xFF:
+            position += 1
+        elif marker == 0x01 or 0xD0 <= marker <= 0xD7:
+            position += 2
+        else:
+            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+            if marker == 0xDA:
+                found = _JPEG_MARKER.search(data, position)
+                position = found.start() if found else len(data)
+    raise InputError(f"{path}: truncated JPEG, the file of {len(data)} bytes has no end marker (EOI).")
+
+
+def _natural(name: str) -> list[tuple[bool, int | str]]:
+    return [(True, int(part)) if part.isdigit() else (False, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def to_uint16(image: np.ndarray) -> np.ndarray:
+    """Clip to [0, 1] and round to 0..65535. NaN (no value) becomes 0, because integers have none."""
+    scaled = np.clip(np.nan_to_num(np.asarray(image), nan=0.0), 0.0, 1.0) * 65535.0
+    return np.asarray(np.round(scaled), dtype=np.uint16)
+
+
+def write_png16(path: Path, image: np.ndarray) -> None:
+    """Write (H, W), (H, W, 1) or RGB (H, W, 3) values in [0, 1] as 16-bit PNG; see ``to_uint16`` for the rounding.
+
+    Raises:
+        InputError: not 1 or 3 channels, or the disk refused.
+    """
+    pixels = to_uint16(image)
+    if pixels.ndim == 3 and pixels.shape[2] == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    elif pixels.ndim != 2 and not (pixels.ndim == 3 and pixels.shape[2] == 1):
+        raise InputError(f"{path}: an image of shape {image.shape} does not fit a PNG file, which holds one or three channels.")
+    # encoded in memory: cv2.imwrite does not report a full disk
+    data = cv2.imencode(".png", pixels)[1].tobytes()
+    write_atomic(Path(path), lambda temporary: temporary.write_bytes(data))
+
+
+def write_exr(path: Path, channels: Mapping[str, np.ndarray]) -> None:
+    """Write named (H, W) channels as 32-bit float OpenEXR (ZIP, lossless; NaN is kept)."""
+    arrays = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+
+    def write(temporary: Path) -> None:
+        try:
+            OpenEXR.File(header, arrays).write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(_first_line(error)) from error
+
+    write_atomic(Path(path), write)
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as compressed npz; ``read_image`` reads the one called ``data``."""
+    write_atomic(Path(path), lambda temporary: np.savez_compressed(temporary, allow_pickle=False, **dict(arrays)))
+
+
+def write_tiff16(path: Path, image: np.ndarray) -> None:
+    """Write (H, W) or (H, W, C) values in [0, 1] as 16-bit TIFF (zlib, any channel count); rounding as ``to_uint16``."""
+    pixels = to_uint16(image)
+    photometric = "rgb" if pixels.ndim == 3 and pixels.shape[2] == 3 else "minisblack"
+    planar = "contig" if pixels.ndim == 3 else None
+    write_atomic(
+        Path(path),
+        lambda temporary: tifffile.imwrite(
+            temporary, pixels, photometric=photometric, planarconfig=planar, compression="zlib", metadata=None
+        ),
+    )

@@ -1,0 +1,179 @@
+"""What is in a scene, for people and for programs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.scene.images import check_file, load_frame, read_native, used_bits
+from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.sensors.camera import Camera, unproject
+
+
+def describe(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
+    """Summarise a scene as a JSON-serialisable dictionary.
+
+    Every image file is checked to be complete; pixel statistics come from at most ``measured_frames`` frames per sensor, evenly
+    spread over its views. Damaged images are listed under ``problems`` and do not raise.
+
+    Returns:
+        scene, format, unit, black_background, region {centre, radius}, split {train, test, source}, problems, and
+        sensors: by name the dictionary of ``_describe_sensor``.
+    """
+    problems = list(scene.problems)
+    sensors = {name: _describe_sensor(scene, sensor, measured_frames, problems) for name, sensor in scene.sensors.items()}
+    return {
+        "scene": str(scene.root),
+        "format": scene.format,
+        "unit": scene.unit,
+        "black_background": scene.black_background,
+        "region": {"centre": [float(value) for value in scene.region.centre], "radius": float(scene.region.radius)},
+        "split": {"train": list(scene.split.train), "test": list(scene.split.test), "source": scene.split.source},
+        "sensors": sensors,
+        "problems": problems,
+    }
+
+
+def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problems: list[str]) -> dict[str, Any]:
+    """frames (and how many train, test, have a mask), size [width, height] of the first frame, channels, wavelengths_nm, mosaic,
+    polarizer_angles_deg, file_type, bits in use and saturation (None: float data, never), pixel statistics mean, min, max,
+    saturated_percent over frames_measured, and invalid_lens_pixels: photosites of the first frame without a ray (an estimate from
+    every n-th row and column where the frame has more than 250 000 pixels)."""
+    frames = scene.frames_of(sensor.name)
+    camera = frames[0].camera
+    out: dict[str, Any] = {
+        "frames": len(frames),
+        "train": sum(frame.view in scene.split.train for frame in frames),
+        "test": sum(frame.view in scene.split.test for frame in frames),
+        "masks": sum(frame.mask is not None for frame in frames),
+        "size": [camera.width, camera.height],
+        "cameras": len({frame.camera for frame in frames}),
+        "channels": list(sensor.channels),
+        "wavelengths_nm": list(sensor.wavelengths_nm),
+        "mosaic": None if sensor.mosaic is None else sensor.mosaic.tolist(),
+        "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
+        "saturation": sensor.saturation if math.isfinite(sensor.saturation) else None,
+        "invalid_lens_pixels": invalid_lens_pixels(camera),
+    }
+    problems += _damaged(frames)
+    out |= _file_type(frames, problems) | _statistics(sensor, frames, measured_frames, problems)
+    if out["file_type"] == "uint16" and out["max"] is not None and out["max"] <= 4095 / 65535:
+        problems.append(f"{sensor.name}: no value exceeds {out['max']:.3f} of full scale, as in 12-bit data that is not left-aligned.")
+    return out
+
+
+def invalid_lens_pixels(camera: Camera, most: int = 250_000) -> int:
+    """How many photosites have no ray, because the lens model has no inverse there; estimated on a grid of ``most`` pixels."""
+    step = math.ceil(math.sqrt(max(1.0, camera.width * camera.height / most)))
+    v, u = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
+    _, valid = unproject(np.stack([u, v], -1).astype(np.float64), camera)
+    return round(float(np.mean(~valid)) * camera.width * camera.height)
+
+
+def _damaged(frames: tuple[Frame, ...]) -> list[str]:
+    found = []
+    for frame in frames:
+        for path in (frame.path, frame.mask):
+            try:
+                if path is not None:
+                    check_file(path)
+            except InputError as error:
+                found.append(str(error))
+    return found
+
+
+def _file_type(frames: tuple[Frame, ...], problems: list[str]) -> dict[str, Any]:
+    try:
+        raw = read_native(frames[0].path)
+    except InputError as error:
+        _add(problems, error)
+        return {"file_type": None, "bits": None}
+    return {"file_type": str(raw.dtype), "bits": used_bits(raw) if raw.dtype.kind == "u" else raw.dtype.itemsize * 8}
+
+
+def _statistics(sensor: Sensor, frames: tuple[Frame, ...], most: int, problems: list[str]) -> dict[str, Any]:
+    chosen = sorted({round(index) for index in np.linspace(0, len(frames) - 1, min(most, len(frames)))})
+    count, total, saturated, low, high = 0, 0.0, 0, math.inf, -math.inf
+    measured = 0
+    for index in chosen:
+        try:
+            pixels, _ = load_frame(sensor, frames[index])
+        except InputError as error:
+            _add(problems, error)
+            continue
+        measured += 1
+        count += pixels.size
+        total += float(pixels.sum(dtype=np.float64))
+        saturated += int(np.count_nonzero(pixels >= sensor.saturation))
+        low, high = min(low, float(pixels.min())), max(high, float(pixels.max()))
+    if not count:
+        return {"frames_measured": 0, "mean": None, "min": None, "max": None, "saturated_percent": None}
+    return {
+        "frames_measured": measured,
+        "mean": total / count,
+        "min": low,
+        "max": high,
+        "saturated_percent": 100.0 * saturated / count,
+    }
+
+
+def _add(problems: list[str], error: InputError) -> None:
+    """A damaged file is found by the check and again by reading it: one sentence per file is enough."""
+    text = str(error)
+    if not any(problem.split(": ")[0] == text.split(": ")[0] for problem in problems):
+        problems.append(text)
+
+
+# --- text ------------------------------------------------------------------------------------------------------------
+
+
+def render_text(description: dict[str, Any]) -> str:
+    """The dictionary of ``describe`` as plain text, some lines per sensor."""
+    region, split = description["region"], description["split"]
+    lines = [
+        f"{description['scene']}  ({description['format']})",
+        f"region   ball around ({', '.join(f'{value:.4g}' for value in region['centre'])}), "
+        f"radius {region['radius']:.4g} {description['unit']}" + (", black background" if description["black_background"] else ""),
+        f"views    {len(split['train'])} train, {len(split['test'])} test: {_ids(split['test'])} ({split['source']})",
+    ]
+    for name, sensor in description["sensors"].items():
+        lines += ["", *_sensor_lines(name, sensor)]
+    if description["problems"]:
+        lines += ["", "problems", *(f"  - {problem}" for problem in description["problems"])]
+    return "\n".join(lines) + "\n"
+
+
+def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
+    width, height = sensor["size"]
+    masks = f", {sensor['masks']} with a mask" if sensor["masks"] else ""
+    lines = [
+        f"{name}",
+        f"  frames    {sensor['frames']} ({sensor['train']} train, {sensor['test']} test{masks}), {width}x{height} pixels",
+        f"  channels  {' '.join(sensor['channels'])}" + _pattern(sensor["mosaic"]),
+    ]
+    if sensor["polarizer_angles_deg"] is not None:
+        lines.append(
+            f"  polarizer {' '.join(f'{angle:g}' for angle in sensor['polarizer_angles_deg'])} degrees, from image right towards image up"
+        )
+    if sensor["file_type"] is not None:
+        lines.append(f"  files     {sensor['file_type']}, {sensor['bits']} bits in use")
+    if sensor["mean"] is not None:
+        lines.append(
+            f"  values    {sensor['min']:.4f} to {sensor['max']:.4f}, mean {sensor['mean']:.4f}, "
+            f"{sensor['saturated_percent']:.2f} % saturated (in {sensor['frames_measured']} frames)"
+        )
+    if sensor["invalid_lens_pixels"]:
+        share = 100 * sensor["invalid_lens_pixels"] / (width * height)
+        lines.append(f"  lens      {sensor['invalid_lens_pixels']} pixels ({share:.2f} %) have no ray and are not used")
+    return lines
+
+
+def _pattern(mosaic: list[list[int]] | None) -> str:
+    return "" if mosaic is None else ", mosaic " + " / ".join(" ".join(map(str, row)) for row in mosaic)
+
+
+def _ids(views: list[int], most: int = 12) -> str:
+    return ", ".join(map(str, views[:most])) + (", ..." if len(views) > most else "")

@@ -1,0 +1,92 @@
+"""Read a scene of any known format, and refuse one that nothing can be learned from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.scene.middlebury import read_middlebury
+from mmsynth.scene.mmsdata import read_mmsdata
+from mmsynth.scene.nerfstudio import read_nerfstudio
+from mmsynth.scene.scene import Frame, Region, Scene
+from mmsynth.sensors.camera import project, unproject
+
+
+def load_scene(path: Path | str, modalities: Sequence[str] | None = None) -> Scene:
+    """Read a scene; the format is told by what the folder holds.
+
+    ``meta_data.json``: MMS-DATA; ``transforms.json``: nerfstudio or instant-ngp; ``*_par.txt``: Middlebury.
+
+    Args:
+        path: the scene's folder, or one of these JSON files.
+        modalities: names or aliases of the sensors to read; None: all.
+    Raises:
+        InputError: nothing there, unknown format or modality, bad metadata, fewer than two frames to train on, or no
+            camera that sees the region of interest.
+    """
+    path = Path(path)
+    scene = _reader(path)(path.parent if path.name == "meta_data.json" else path, modalities)
+    training = [frame for frame in scene.frames if frame.view in scene.split.train]
+    if len(training) < 2:
+        raise InputError(f"{path}: {len(training)} frames to train on ({len(scene.frames)} in all), expected at least 2.")
+    problems = list(scene.problems)
+    for name in scene.sensors:
+        if not any(frame.sensor == name for frame in training):
+            problems.append(f"{name}: none of its frames is in a training view.")
+    blind = [frame for frame in scene.frames if not sees(frame, scene.region)]
+    if len(blind) == len(scene.frames):
+        raise InputError(
+            f"{path}: no camera sees the region of interest (centre {_rounded(scene.region.centre)}, radius {scene.region.radius:.4g}), "
+            "expected poses and region in one frame."
+        )
+    if blind:
+        example = f"{blind[0].sensor} view {blind[0].view}"
+        problems.append(f"{len(blind)} of {len(scene.frames)} frames do not see the region of interest, the first is {example}.")
+    return dataclasses.replace(scene, problems=tuple(problems))
+
+
+def _reader(path: Path) -> Callable[[Path, Sequence[str] | None], Scene]:
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder.")
+    if path.is_file():
+        if path.name == "meta_data.json":
+            return read_mmsdata
+        if path.suffix.lower() == ".json":
+            return read_nerfstudio
+        raise InputError(f"{path}: not a scene, expected a folder or its JSON file.")
+    if (path / "meta_data.json").is_file():
+        return read_mmsdata
+    if (path / "transforms.json").is_file():
+        return read_nerfstudio
+    if any(path.glob("*_par.txt")):
+        return read_middlebury
+    if (path / "calibration.json").is_file():
+        raise InputError(f"{path}: calibration.json without meta_data.json is an MMS-DATA source scene, which has no camera poses.")
+    raise InputError(f"{path}: not a scene, expected meta_data.json (MMS-DATA), transforms.json (nerfstudio) or *_par.txt (Middlebury).")
+
+
+def sees(frame: Frame, region: Region) -> bool:
+    """Whether a ray of the frame meets the region: one of 9x9 rays over the frame, corners included, or the one to its centre."""
+    camera = frame.camera
+    to_camera = np.linalg.inv(frame.camera_to_world)
+    centre = to_camera[:3, :3] @ np.asarray(region.centre) + to_camera[:3, 3]
+    if np.linalg.norm(centre) <= region.radius:
+        return True  # the camera is inside
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
+    directions, valid = unproject(np.stack([u, v], -1).reshape(-1, 2), camera)
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    along = directions @ centre
+    hit = valid & (along > 0) & (centre @ centre - along**2 <= region.radius**2)
+    if hit.any():
+        return True
+    # a region smaller than the spacing of the rays
+    pixel = project(centre, camera)
+    return bool(np.all(pixel >= -0.5) and np.all(pixel <= np.array([camera.width, camera.height]) - 0.5))
+
+
+def _rounded(point: tuple[float, float, float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"

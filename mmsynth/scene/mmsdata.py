@@ -1,0 +1,269 @@
+"""MMS-DATA scenes in the preprocessed layout: ``meta_data.json`` and ``modalities/<name>/<file>``.
+
+Facts of the format, and what is made of them:
+
+* ``camtoworld`` is camera-to-world in OpenGL axes, in a normalised world; ``worldtogt`` takes that world to metres. The
+  scene is given in the metric frame when ``worldtogt`` is there; the scene box (a ball of ``radius`` around the world's origin) becomes
+  the region of interest.
+* ``distortion_params`` is k1 k2 p1 p2 k3 k4, which is OpenCV's order; only read when ``undistorted`` is false.
+* ``pixel_offset`` is added to pixel indices before un-projection, so here it is subtracted from cx and cy.
+* ``mosaick_pattern`` counts when ``raw`` is true; the file's pattern wins over the one known for the modality.
+* Frames are kept by their ``frame_id``: ids may have gaps and modalities may have different views.
+
+Optional keys of a modality that MMS-DATA does not have and that describe any other sensor: ``channels`` (labels), ``wavelengths_nm``
+(a number or null per channel), ``polarizer_angles_deg`` (per channel, from image right towards image up).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.files import read_json
+from mmsynth.scene.images import read_native, saturation_level
+from mmsynth.scene.poses import OPENGL_TO_OPENCV, number, rigid, whole
+from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, canonical_modality, make_split
+from mmsynth.sensors.camera import Camera
+
+_MS_NM = (692.0, 653.0, 611.0, 572.0, 541.0, 503.0, 464.0, 431.0, None)
+
+# labels, wavelengths (None: broad), polarizer angles and raw pattern of the modalities of MMS-DATA
+_KNOWN: dict[str, dict[str, Any]] = {
+    "rgb": {"channels": ("R", "G", "B"), "pattern": [[1, 2], [0, 1]]},
+    "mono": {"channels": ("mono",), "pattern": [[0]]},
+    "nir": {"channels": ("nir",), "pattern": [[0]]},
+    "pol": {"channels": ("I0", "I45", "I90", "I135"), "angles": (0.0, 45.0, 90.0, 135.0), "pattern": [[2, 1], [3, 0]]},
+    "ms": {
+        "channels": tuple("pan" if nm is None else f"{nm:.0f}nm" for nm in _MS_NM),
+        "wavelengths": _MS_NM,
+        "pattern": [[4, 5, 6], [2, 1, 0], [3, 8, 7]],
+    },
+}
+
+_PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE")
+_MODELS = (*_PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
+    """Read an MMS-DATA scene.
+
+    Args:
+        root: folder with ``meta_data.json``.
+        modalities: names or aliases to read; None: all.
+    Raises:
+        InputError: missing or wrong key, pose that is not finite and rigid, unknown modality, a modality without images.
+    """
+    root = Path(root)
+    path = root / "meta_data.json"
+    meta = read_json(path)
+    if not isinstance(meta, dict) or not isinstance(meta.get("modalities"), dict) or not meta["modalities"]:
+        raise InputError(f"{path}: key 'modalities' is missing or empty, expected an object with one entry per sensor.")
+    raw, undistorted = _flag(meta, "raw", path), _flag(meta, "undistorted", path)
+    to_output, scale, unit = _world_to_output(meta, path)
+    offset = number(meta, "pixel_offset", str(path)) if "pixel_offset" in meta else 0.0
+
+    sources = {source: canonical_modality(source) for source in meta["modalities"]}
+    for name, count in Counter(sources.values()).items():
+        if count > 1:
+            raise InputError(f"{path}: {count} modalities are called '{name}' or an alias of it, expected one.")
+    wanted = wanted_modalities(sources.values(), modalities, path)
+    sensors: dict[str, Sensor] = {}
+    frames: list[Frame] = []
+    problems: list[str] = []
+    for source, name in sources.items():
+        if name not in wanted:
+            continue
+        entry = meta["modalities"][source]
+        where = f"{path}: modality '{source}'"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where} is not an object.")
+        camera = _camera(entry, where, undistorted, offset)
+        present, missing = _frames(entry, where, root, source, name, camera, to_output, scale)
+        if not present:
+            raise InputError(f"{where} has no image files in {root / 'modalities' / source}; leave it out to use the other modalities.")
+        if missing:
+            problems.append(f"{name}: {missing} of {missing + len(present)} frames have no image file and are left out.")
+        sensors[name] = make_sensor(name, entry, where, read_native(present[0].path), raw)
+        frames += present
+    split = _split(root, meta["modalities"], (frame.view for frame in frames))
+    box = meta.get("scene_box")
+    radius = number(box, "radius", f"{path}: key 'scene_box'") if isinstance(box, dict) and "radius" in box else 1.0
+    if radius <= 0:
+        raise InputError(f"{path}: key 'scene_box': radius {radius}, expected a positive number.")
+    centre = to_output[:3, 3]
+    region = Region((float(centre[0]), float(centre[1]), float(centre[2])), scale * radius)
+    return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
+
+
+def wanted_modalities(known: Iterable[str], asked: Sequence[str] | None, path: Path) -> set[str]:
+    """Canonical names to read; an InputError lists the known ones if one asked for is not among them."""
+    names = list(known)
+    if asked is None:
+        return set(names)
+    for name in asked:
+        if canonical_modality(name) not in names:
+            raise InputError(f"{path}: no modality '{name}' in this scene, expected one of {', '.join(names)}.")
+    if not asked:
+        raise InputError(f"{path}: no modality asked for, expected at least one of {', '.join(names)}.")
+    return {canonical_modality(name) for name in asked}
+
+
+def make_sensor(name: str, entry: Mapping[str, Any], where: str, image: np.ndarray, raw: bool) -> Sensor:
+    """Describe a sensor by its entry in the file, what is known about its name, and its first image.
+
+    Args:
+        name: canonical modality name; an unknown one is a plain radiance modality.
+        entry: may hold ``mosaick_pattern``, ``channels``, ``wavelengths_nm``, ``polarizer_angles_deg``.
+        image: the first frame as stored, for the channel count of full-channel frames and the saturation level.
+        raw: frames are mosaicked. A pattern of one channel counts as no mosaic.
+    Raises:
+        InputError: pattern with holes or not a matrix, or lists whose length is not the channel count.
+    """
+    known = _KNOWN.get(name, {})
+    for key, types in (("channels", (str,)), ("wavelengths_nm", (int, float, type(None))), ("polarizer_angles_deg", (int, float))):
+        values = entry.get(key, [])
+        if not isinstance(values, list) or not all(isinstance(value, types) for value in values):
+            raise InputError(f"{where}: key '{key}' is {values!r}, expected a list with one entry per channel.")
+    given = entry.get("mosaick_pattern", known.get("pattern")) if raw else None
+    mosaic = None if given is None else _pattern(given, where)
+    if mosaic is not None:
+        count = int(mosaic.max()) + 1
+    else:
+        count = 1 if image.ndim == 2 else image.shape[2]
+        # grey + alpha and RGB + alpha: load_frame takes the alpha off
+        expected = len(entry.get("channels", known.get("channels", ())))
+        if (count == 2 and expected in (0, 1)) or (count == 4 and expected in (0, 1, 3)):
+            count = expected or count - 1
+    labels = entry.get("channels")
+    if labels is None:
+        labels = known["channels"] if len(known.get("channels", ())) == count else _plain_labels(name, count)
+    same = tuple(labels) == known.get("channels")
+    wavelengths = entry.get("wavelengths_nm") or (known.get("wavelengths") if same else None) or (None,) * count
+    angles = entry.get("polarizer_angles_deg") or (known.get("angles") if same else None)
+    if name == "pol" and angles is None:
+        raise InputError(f"{where}: {count} polarization channels, expected 4 or the key 'polarizer_angles_deg' with an angle for each.")
+    for key, values in (("channels", labels), ("wavelengths_nm", wavelengths), ("polarizer_angles_deg", angles)):
+        if values is not None and len(values) != count:
+            raise InputError(f"{where}: key '{key}' has {len(values)} entries, expected {count}, one per channel.")
+    return Sensor(
+        name=name,
+        channels=tuple(str(label) for label in labels),
+        wavelengths_nm=tuple(None if nm is None else float(nm) for nm in wavelengths),
+        mosaic=mosaic if count > 1 else None,
+        polarizer_angles_deg=None if angles is None else tuple(float(angle) for angle in angles),
+        saturation=saturation_level(image),
+    )
+
+
+def _plain_labels(name: str, count: int) -> tuple[str, ...]:
+    return (name,) if count == 1 else ("R", "G", "B") if count == 3 else tuple(str(index) for index in range(count))
+
+
+def _pattern(given: Any, where: str) -> np.ndarray:
+    try:
+        pattern = np.asarray(given)
+    except ValueError:
+        pattern = np.empty(0)
+    if pattern.ndim != 2 or pattern.size == 0 or pattern.dtype.kind not in "iu":
+        raise InputError(f"{where}: key 'mosaick_pattern' is {given}, expected a matrix of channel numbers.")
+    present = np.unique(pattern)
+    if not np.array_equal(present, np.arange(len(present))):
+        raise InputError(f"{where}: key 'mosaick_pattern' holds the channels {present.tolist()}, expected 0 to {len(present) - 1}.")
+    return pattern.astype(np.int64)
+
+
+def _flag(meta: Mapping[str, Any], key: str, path: Path) -> bool:
+    if not isinstance(meta.get(key), bool):
+        raise InputError(f"{path}: key '{key}' is {meta.get(key, 'missing')!r}, expected true or false.")
+    return bool(meta[key])
+
+
+def _world_to_output(meta: Mapping[str, Any], path: Path) -> tuple[np.ndarray, float, str]:
+    """The similarity to the frame of the Scene: rigid part with translation (4, 4), scale, unit."""
+    if meta.get("worldtogt") is None:
+        return np.eye(4), 1.0, "input unit"
+    where = f"{path}: key 'worldtogt'"
+    try:
+        matrix = np.asarray(meta["worldtogt"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} is not a matrix of numbers, expected 4x4.") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{where} is not a finite 4x4 matrix, expected a similarity (rotation, one scale, translation).")
+    scale = float(np.sqrt((matrix[:3, :3] ** 2).sum() / 3))  # of a similarity: every row has the length s
+    if scale <= 0:
+        raise InputError(f"{where} is singular, expected a similarity (rotation, one scale, translation).")
+    unscaled = matrix.copy()
+    unscaled[:3, :3] /= scale
+    try:
+        return rigid(unscaled, where), scale, "m"
+    except InputError as error:
+        raise InputError(f"{where} is not a similarity, expected a rotation, one scale and a translation.") from error
+
+
+def _camera(entry: Mapping[str, Any], where: str, undistorted: bool, offset: float) -> Camera:
+    model = str(entry.get("camera_model", "OPENCV")).upper()
+    if model not in _MODELS:
+        raise InputError(f"{where}: camera_model {model} is not supported yet, expected one of {' '.join(_MODELS)}.")
+    distortion: tuple[float, ...] = ()
+    if not undistorted and model not in _PINHOLE_MODELS:
+        given = entry.get("distortion_params")
+        if not isinstance(given, list) or len(given) != 6 or not all(isinstance(value, (int, float)) for value in given):
+            raise InputError(f"{where}: key 'distortion_params' is {given}, expected the six numbers k1 k2 p1 p2 k3 k4.")
+        distortion = tuple(float(value) for value in given) if any(given) else ()
+    try:
+        return Camera(
+            width=whole(entry, "width", where),
+            height=whole(entry, "height", where),
+            fx=number(entry, "fx", where),
+            fy=number(entry, "fy", where),
+            cx=number(entry, "cx", where) - offset,
+            cy=number(entry, "cy", where) - offset,
+            distortion=distortion,
+        )
+    except InputError as error:
+        raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from error
+
+
+def _frames(
+    entry: Mapping[str, Any], where: str, root: Path, source: str, name: str, camera: Camera, to_output: np.ndarray, scale: float
+) -> tuple[list[Frame], int]:
+    """Frames with an image file, by view, and the count of those without."""
+    present: dict[int, Frame] = {}
+    missing = 0
+    seen: set[int] = set()
+    for index, item in enumerate(_frame_entries(entry, where)):
+        view = whole(item, "frame_id", f"{where}, frame entry {index}")
+        here = f"{where}, frame {view}"
+        if view in seen:
+            raise InputError(f"{here} is listed twice, expected every frame_id once.")
+        seen.add(view)
+        if not isinstance(item.get("file_name"), str):
+            raise InputError(f"{here}: key 'file_name' is {item.get('file_name', 'missing')!r}, expected the name of an image file.")
+        pose = rigid(item.get("camtoworld"), here) @ OPENGL_TO_OPENCV
+        pose[:3, 3] *= scale  # then the rigid part: together s R x + t
+        path = root / "modalities" / source / item["file_name"]
+        if not path.is_file():
+            missing += 1
+            continue
+        mask = root / "masks" / source / f"{view:04d}.png"
+        present[view] = Frame(name, view, path, camera, to_output @ pose, source, mask if mask.is_file() else None)
+    return [present[view] for view in sorted(present)], missing
+
+
+def _frame_entries(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
+    items = entry.get("frames")
+    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+        raise InputError(f"{where}: key 'frames' is not a list of objects.")
+    return items
+
+
+def _split(root: Path, sources: Iterable[str], views: Iterable[int]) -> Split:
+    """Test views: those that have a ground truth image in ``gt/<modality>/``."""
+    folders = [root / "gt" / source for source in sources]
+    stems = {file.stem for folder in folders if folder.is_dir() for file in folder.iterdir()}
+    return make_split(views, (int(stem) for stem in stems if stem.isdecimal()), "views in gt/")

@@ -1,0 +1,172 @@
+"""The commands as a user runs them: in a folder of their own, as a subprocess, on the packaged example scene."""
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mmsynth.data import data_folder
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(cwd: Path, *args: str, largest_file: int | None = None) -> subprocess.CompletedProcess[str]:
+    def limit() -> None:
+        if largest_file is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+    return subprocess.run(
+        [sys.executable, "-m", "mmsynth", *args], cwd=cwd, env=environment, capture_output=True, text=True, preexec_fn=limit
+    )
+
+
+def refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Exit code 2, one sentence on stderr, nothing on stdout, no traceback."""
+    assert result.returncode == 2, result.stderr
+    lines = [x for x in result.stderr.splitlines() if not x.startswith("compiling kernels")]
+    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
+    for word in words:
+        assert word in lines[0], lines[0]
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("work")
+    result = run(folder, "fit", "example", "--steps", "25", "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["steps"] == 25
+    return folder
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A copy of the example scene to break."""
+    return Path(shutil.copytree(data_folder("example_scene"), tmp_path / "scene"))
+
+
+def test_fit_leaves_a_run(fitted: Path) -> None:
+    latest = fitted / "runs" / "latest"
+    assert latest.resolve() == (fitted / "runs" / "example_scene").resolve()
+    for name in ("field.safetensors", "manifest.json", "train.jsonl", "report.html", "preview.png", "checkpoint/state.pt"):
+        assert (latest / name).stat().st_size > 0, name
+    assert not list(fitted.rglob("*.tmp*"))
+
+
+def test_info(tmp_path: Path) -> None:
+    result = run(tmp_path, "info", "example")
+    assert result.returncode == 0 and "ms" in result.stdout and "24 frames" in result.stdout.replace("frames    24", "24 frames")
+    assert set(json.loads(run(tmp_path, "info", "example", "--json").stdout)["sensors"]) == {"rgb", "nir", "mono", "pol", "ms"}
+
+
+def test_evaluate(fitted: Path) -> None:
+    result = run(fitted, "evaluate", "--json")
+    assert result.returncode == 0, result.stderr
+    scores = json.loads(result.stdout)
+    assert set(scores["modalities"]) == {"rgb", "nir", "mono", "pol", "ms"}
+    for modality in scores["modalities"].values():
+        assert {"psnr", "psnr_foreground", "ssim", "psnr_truth"} <= set(modality)
+        assert modality["foreground_from"] == "gt"
+    assert scores["rays_per_s"] > 0 and scores["seconds"]
+
+
+def test_convert(fitted: Path) -> None:
+    result = run(fitted, "convert", "--from", "rgb", "--to", "ms", "--views", "9")
+    assert result.returncode == 0, result.stderr
+    (file,) = (fitted / "runs/latest/convert/rgb_to_ms").rglob("*.npz")
+    assert np.load(file)["data"].shape == (72, 96, 9)
+
+
+def test_generate_dataset_resumes_and_verifies(fitted: Path) -> None:
+    result = run(fitted, "generate-dataset", "--poses", "poses.json", "--modalities", "rgb,pol")
+    assert result.returncode == 0, result.stderr
+    dataset = fitted / "runs/latest/dataset"
+    before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*.npz")}
+    assert len(json.loads((dataset / "dataset.json").read_text())["views"]) == 12 and before
+    assert run(fitted, "generate-dataset", "--poses", "poses.json", "--modalities", "rgb,pol").returncode == 0
+    assert {p: p.stat().st_mtime_ns for p in dataset.rglob("*.npz")} == before
+    assert run(fitted, "generate-dataset", "--poses", "poses.json", "--verify").returncode == 0
+    victim = next(iter(before))
+    victim.write_bytes(victim.read_bytes()[:-5])
+    refused(run(fitted, "generate-dataset", "--poses", "poses.json", "--verify"), "problem")
+
+
+def test_mesh(fitted: Path) -> None:
+    import trimesh
+
+    result = run(fitted, "mesh", "--resolution", "48", "--json")
+    assert result.returncode == 0, result.stderr
+    mesh = trimesh.load(fitted / "runs/latest/mesh.ply")
+    assert len(mesh.faces) == json.loads(result.stdout)["faces"] > 100
+    assert np.abs(mesh.vertices - np.array([0.0, 0.0, 0.105])).max() < 0.28  # metres, in the scene's own frame
+
+
+def test_doctor(tmp_path: Path) -> None:
+    facts = json.loads(run(tmp_path, "doctor", "--json").stdout)
+    assert facts["versions"]["torch"] and facts["cores"] >= 1
+
+
+def test_bad_scenes_are_refused_in_one_sentence(scene: Path, tmp_path: Path) -> None:
+    refused(run(tmp_path, "fit", "nowhere"), "nowhere")
+    meta = scene / "meta_data.json"
+    good = meta.read_text()
+
+    meta.write_text(good[:200])
+    refused(run(tmp_path, "fit", "scene"), "meta_data.json", "line")
+
+    broken = json.loads(good)
+    broken["modalities"]["rgb"]["frames"][3]["camtoworld"][1][2] = float("nan")
+    meta.write_text(json.dumps(broken))
+    refused(run(tmp_path, "fit", "scene"), "meta_data.json", "rgb")
+
+    far = json.loads(good)
+    for modality in far["modalities"].values():
+        for frame in modality["frames"]:
+            for row in frame["camtoworld"]:
+                row[3] += 1000.0
+    meta.write_text(json.dumps(far))
+    refused(run(tmp_path, "fit", "scene"), "region")
+
+    meta.write_text(good)
+    refused(run(tmp_path, "fit", "scene", "--modalities", "rgb,thermal"), "thermal", "rgb")
+    refused(run(tmp_path, "fit", "scene", "--recipe", "nothing"), "nothing")
+    refused(run(tmp_path, "fit", "scene", "--budget", "soon"), "soon")
+    refused(run(tmp_path, "fit", "scene", "--resume"), "resume")
+
+    image = scene / "modalities" / "mono" / "0004.png"
+    image.write_bytes(image.read_bytes()[:-100])
+    refused(run(tmp_path, "fit", "scene", "--steps", "5"), "0004.png")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_commands_without_a_fit_are_refused(tmp_path: Path) -> None:
+    for args in (("evaluate",), ("mesh",), ("convert", "--from", "rgb", "--to", "ms"), ("generate-dataset", "--poses", "poses.json")):
+        refused(run(tmp_path, *args), "fit")
+
+
+def test_bad_requests_on_a_run_are_refused(fitted: Path) -> None:
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "thermal"), "thermal", "ms")
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--views", "777"), "777")
+    refused(run(fitted, "generate-dataset", "--poses", "missing.json"), "missing.json")
+    refused(run(fitted, "mesh", "--out", "mesh.xyz", "--resolution", "16"), "mesh.xyz")
+    (fitted / "nan.json").write_text('{"convention": "OpenCV", "rig": [[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]}')
+    refused(run(fitted, "generate-dataset", "--poses", "nan.json"), "nan.json")
+
+
+def test_a_full_disk_leaves_nothing_half_written(fitted: Path, tmp_path: Path) -> None:
+    """The kernel refuses to let a file grow past a limit, as a full disk would."""
+    refused(run(tmp_path, "fit", "example", "--steps", "3", largest_file=100_000), "could not be written")
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+    for args in (
+        ("mesh", "--resolution", "64", "--out", str(tmp_path / "m.ply")),
+        ("convert", "--from", "rgb", "--to", "ms", "--out", str(tmp_path / "c")),
+    ):
+        refused(run(fitted, *args, largest_file=20_000), "could not be written")
+    assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.suffix != ".json" and p.stat().st_size == 20_000]
+    assert not list(tmp_path.rglob("*tmp*"))

@@ -1,0 +1,92 @@
+"""Small scenes written to disk, in the formats that the readers know."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mmsynth.scene.images import write_png16
+
+WIDTH, HEIGHT = 24, 18
+OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def look_at(position: Iterable[float], target: Iterable[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """(4, 4) camera_to_world in OpenCV axes, z up in the world."""
+    position, target = np.array(list(position), float), np.array(list(target), float)
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([right, np.cross(forward, right), forward, position])
+    return pose
+
+
+def ring(count: int, radius: float = 3.0, height: float = 1.0) -> list[np.ndarray]:
+    """Poses on a ring, looking at the origin."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return [look_at((radius * np.cos(a), radius * np.sin(a), height)) for a in angles]
+
+
+def frame_values(view: int, channels: int = 0) -> np.ndarray:
+    """An image that differs in every view, row, column and channel."""
+    shape = (HEIGHT, WIDTH, channels) if channels else (HEIGHT, WIDTH)
+    return np.random.default_rng(view).random(shape).astype(np.float32)
+
+
+@pytest.fixture
+def write_mmsdata(tmp_path: Path) -> Callable[..., Path]:
+    """Write an MMS-DATA scene (raw, rgb and infrared, Brown lens); ``edit(meta)`` may change meta_data.json before it is written."""
+
+    def write(views: Iterable[int] = range(4), edit: Callable[[dict[str, Any]], None] | None = None) -> Path:
+        views = list(views)
+        root = tmp_path / "scene"
+        modalities = {}
+        for name, pattern in (("rgb", [[1, 2], [0, 1]]), ("infrared", [[0]])):
+            frames = []
+            for view, pose in zip(views, ring(len(views)), strict=True):
+                write_png16(root / "modalities" / name / f"{view:04d}.png", frame_values(view))
+                frames.append({"frame_id": view, "file_name": f"{view:04d}.png", "camtoworld": (pose @ OPENCV_TO_OPENGL)[:3].tolist()})
+            modalities[name] = {
+                "camera_model": "OPENCV", "width": WIDTH, "height": HEIGHT, "fx": 25.0, "fy": 26.0, "cx": 11.7, "cy": 8.4,
+                "distortion_params": [-0.12, 0.09, 0.01, -0.02, 0.003, 0.0], "mosaick_pattern": pattern, "frames": frames,
+            }  # fmt: skip
+        meta: dict[str, Any] = {
+            "undistorted": False, "raw": True, "pixel_offset": 0.0,
+            "scene_box": {"collider_type": "sphere", "radius": 1.0, "aabb": [[-1, -1, -1], [1, 1, 1]]},
+            "worldtogt": [[0.0, -0.25, 0.0, 0.1], [0.25, 0.0, 0.0, 0.2], [0.0, 0.0, 0.25, 0.3], [0.0, 0.0, 0.0, 1.0]],
+            "modalities": modalities,
+        }  # fmt: skip
+        if edit is not None:
+            edit(meta)
+        (root / "meta_data.json").write_text(json.dumps(meta))
+        return root
+
+    return write
+
+
+@pytest.fixture
+def write_transforms(tmp_path: Path) -> Callable[..., Path]:
+    """Write a nerfstudio scene of 16-bit RGB images; ``edit(meta)`` may change transforms.json before it is written."""
+
+    def write(count: int = 4, channels: int = 3, edit: Callable[[dict[str, Any]], None] | None = None) -> Path:
+        root = tmp_path / "scene"
+        frames = []
+        for view, pose in enumerate(ring(count)):
+            write_png16(root / "images" / f"{view:04d}.png", frame_values(view, channels))
+            frames.append({"file_path": f"images/{view:04d}.png", "transform_matrix": (pose @ OPENCV_TO_OPENGL).tolist()})
+        meta: dict[str, Any] = {
+            "fl_x": 25.0, "fl_y": 26.0, "cx": 12.2, "cy": 8.9, "w": float(WIDTH), "h": float(HEIGHT),
+            "k1": -0.12, "k2": 0.09, "p1": 0.01, "p2": -0.02, "frames": frames,
+        }  # fmt: skip
+        if edit is not None:
+            edit(meta)
+        (root / "transforms.json").write_text(json.dumps(meta))
+        return root
+
+    return write

@@ -1,0 +1,157 @@
+"""A field known in closed form: the double that stands in for a learned one in the tests of the operations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from conftest import look_at
+
+from mmsynth.errors import InputError
+from mmsynth.field.field import Rendering
+from mmsynth.scene.images import write_npz, write_png16
+from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
+from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.mosaic import mosaic
+from mmsynth.sensors.polarization import stokes_to_intensities
+
+RGB = Sensor("rgb", ("R", "G", "B"), (None, None, None), np.array([[1, 2], [0, 1]]))
+MONO = Sensor("mono", ("mono",), (None,))
+POL = Sensor("pol", ("0", "45", "90", "135"), (None,) * 4, np.array([[2, 1], [3, 0]]), (0.0, 45.0, 90.0, 135.0))
+MS = Sensor(
+    "ms",
+    ("692", "653", "611", "572", "541", "503", "464", "431", "pan"),
+    (692.0, 653.0, 611.0, 572.0, 541.0, 503.0, 464.0, 431.0, None),
+    np.array([[4, 5, 6], [2, 1, 0], [3, 8, 7]]),
+)
+
+Distance = Callable[[np.ndarray], np.ndarray]
+
+
+def sphere(radius: float = 0.6, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Distance:
+    return lambda p: np.linalg.norm(p - np.asarray(centre), axis=-1) - radius
+
+
+def torus(major: float = 0.5, minor: float = 0.2) -> Distance:
+    return lambda p: np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) - minor
+
+
+class AnalyticField:
+    """Lambertian-like surface under a fixed light; polarization axis along the projected normal, DoLP 0.3."""
+
+    def __init__(self, distance: Distance, sensors: Sequence[Sensor] = (RGB, MS, POL, MONO), region: Region | None = None) -> None:
+        self.distance = distance
+        self.region = region or Region((0.0, 0.0, 0.0), 1.0)
+        self.unit = "m"
+        self.manifest: dict[str, Any] = {}
+        self.sensors = {s.name: s for s in sensors}
+        camera = Camera(24, 18, 26.0, 26.0, 11.3, 8.6, (-0.1, 0.05, 0.001, -0.002))
+        self.cameras = {s.name: camera for s in sensors}
+        self.rig = {s.name: np.eye(4) for s in sensors}
+        for i, s in enumerate(sensors):
+            self.rig[s.name][0, 3] = 0.05 * i
+        self.largest_query = 0
+        self.renders = 0
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {"value": torch.from_numpy(self.sdf(np.eye(3)))}
+
+    def sdf(self, points: np.ndarray) -> np.ndarray:
+        self.largest_query = max(self.largest_query, len(points))
+        return self.distance(np.asarray(points, float)).astype(np.float32)
+
+    def check_modalities(self, modalities: Sequence[str] | None) -> list[str]:
+        names = list(self.sensors) if modalities is None else list(modalities)
+        for name in names:
+            if name not in self.sensors:
+                raise InputError(f"modality {name!r}: not in this field, expected one of {', '.join(self.sensors)}.")
+        return names
+
+    def normal(self, p: np.ndarray) -> np.ndarray:
+        step = 1e-4 * np.eye(3)
+        slope = np.stack([self.distance(p + e) - self.distance(p - e) for e in step], -1)
+        return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+
+    def render(
+        self,
+        camera: Camera,
+        camera_to_world: np.ndarray,
+        modalities: Sequence[str] | None = None,
+        geometry: bool = True,
+        progress: Callable[[int], None] | None = None,
+    ) -> Rendering:
+        names = self.check_modalities(modalities)
+        self.renders += 1
+        in_camera, valid = ray_map(camera)
+        direction = in_camera @ camera_to_world[:3, :3].T
+        t = np.zeros(valid.shape)
+        for _ in range(100):
+            t += np.clip(self.distance(camera_to_world[:3, 3] + direction * t[..., None]), -1, 1)
+        point = camera_to_world[:3, 3] + direction * t[..., None]
+        hit = valid & (np.abs(self.distance(point)) < 1e-4) & (t > 0)
+        normal = self.normal(point)
+        light = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
+        shade = np.where(hit, 0.15 + 0.6 * np.clip(normal @ light, 0, None), 0.05)
+        channels, stokes = {}, {}
+        for name in names:
+            sensor = self.sensors[name]
+            gain = np.linspace(1.0, 0.5, sensor.channel_count)
+            value = shade[..., None] * gain
+            if sensor.polarizer_angles_deg is not None:
+                phi = np.arctan2(-(normal @ camera_to_world[:3, 1]), normal @ camera_to_world[:3, 0])
+                dolp = np.where(hit, 0.3, 0.0)
+                s = np.stack([shade, shade * dolp * np.cos(2 * phi), shade * dolp * np.sin(2 * phi)], -1)
+                stokes[name] = np.where(valid[..., None], s, np.nan).astype(np.float32)
+                value = stokes_to_intensities(s, sensor.polarizer_angles_deg)
+            channels[name] = np.where(valid[..., None], value, np.nan).astype(np.float32)
+        if progress is not None:
+            progress(int(valid.sum()))
+        depth = np.where(hit, t, np.nan).astype(np.float32)
+        return Rendering(
+            channels,
+            stokes,
+            (depth * in_camera[..., 2]).astype(np.float32),
+            depth,
+            np.where(hit[..., None], normal, np.nan).astype(np.float32),
+            hit.astype(np.float32),
+            valid.copy(),
+        )
+
+
+SOURCE_NAMES = {"pol": "polarization", "ms": "multispectral"}
+
+
+def ring_pose(view: int, views: int) -> np.ndarray:
+    angle = 2 * np.pi * view / views
+    return look_at((2.2 * np.cos(angle), 2.2 * np.sin(angle), 1.0))
+
+
+def scene_of(field: AnalyticField, root: Path, views: int = 4, truth: bool = True) -> Scene:
+    """What the rig of the field would have recorded, on disk, with ground truth; the last view tests."""
+    frames = []
+    for name, sensor in field.sensors.items():
+        source = SOURCE_NAMES.get(name, name)
+        for view in range(views):
+            camera, pose = field.cameras[name], ring_pose(view, views) @ field.rig[name]
+            seen = field.render(camera, pose, [name])
+            light = np.nan_to_num(seen.channels[name])
+            path = root / "modalities" / source / f"{view:04d}.png"
+            write_png16(
+                path, light[..., 0] if sensor.channel_count == 1 else light if sensor.mosaic is None else mosaic(light, sensor.mosaic)
+            )
+            frames.append(Frame(name, view, path, camera, pose, source))
+            if truth and view == views - 1:
+                write_npz(root / "gt" / source / f"{view:04d}.npz", {"data": seen.stokes.get(name, light)})
+                write_npz(root / "gt" / "masks" / f"{view:04d}_{source}.npz", {"in_roi": seen.opacity > 0.5})
+    if truth:
+        pose = ring_pose(views - 1, views)
+        seen = field.render(field.cameras["rgb"], pose)
+        aligned = {SOURCE_NAMES.get(n, n): seen.stokes.get(n, seen.channels[n]) for n in field.sensors if n != "rgb"}
+        write_npz(root / "gt" / "aligned" / f"{views - 1:04d}.npz", aligned)
+        geometry = {"depth_z": np.nan_to_num(seen.depth_z), "normal": np.nan_to_num(seen.normal), "in_roi": seen.opacity > 0.5}
+        write_npz(root / "gt" / "geometry" / f"{views - 1:04d}.npz", geometry)
+    split = Split(tuple(range(views - 1)), (views - 1,), "test")
+    return Scene(root, "test", dict(field.sensors), tuple(frames), field.region, split, "m")

@@ -1,0 +1,136 @@
+"""Datasets: complete, resumable, verifiable, the same bytes every time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import AnalyticField, ring_pose, sphere
+
+from mmsynth.errors import InputError
+from mmsynth.operations.dataset import generate_dataset, verify
+from mmsynth.operations.trajectories import View
+from mmsynth.scene.images import read_image
+from mmsynth.scene.poses import read_poses
+
+
+def views_of(field: AnalyticField, count: int = 2) -> list[View]:
+    return [(field.cameras["rgb"], ring_pose(i, 7), f"view {i}") for i in range(count)]
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("rig", ["aligned", "native"])
+@pytest.mark.parametrize("format", ["npz", "exr", "tiff"])
+def test_complete_and_identical_on_rerun(tmp_path: Path, rig: str, format: str) -> None:
+    field = AnalyticField(sphere())
+    calls: list[tuple[int, int]] = []
+    path = generate_dataset(field, views_of(field), tmp_path / "a", rig=rig, format=format, progress=lambda *c: calls.append(c))  # type: ignore[arg-type]
+    assert path == tmp_path / "a/dataset.json" and verify(tmp_path / "a") == []
+    assert calls[-1][0] == calls[-1][1] and calls == sorted(calls)
+    stated = json.loads(path.read_text())
+    assert set(stated["modalities"]) == {"rgb", "ms", "pol", "mono"} and stated["unit"] == "m" and len(stated["field"]) == 64
+    for view in stated["views"]:
+        on_disk = {p.name for p in (tmp_path / "a" / view["folder"]).iterdir()}
+        assert on_disk == set(view["files"]) | {"view.json"}
+    generate_dataset(field, views_of(field), tmp_path / "b", rig=rig, format=format)  # type: ignore[arg-type]
+    assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+def test_values_in_every_format(tmp_path: Path) -> None:
+    field = AnalyticField(sphere())
+    camera, pose, _ = views_of(field)[0]
+    truth = field.render(camera, pose)
+    for format in ("npz", "exr", "tiff"):
+        generate_dataset(field, views_of(field, 1), tmp_path / format, format=format)  # type: ignore[arg-type]
+    with np.load(tmp_path / "npz/views/0000/geometry.npz") as arrays:
+        for key in ("depth_z", "depth_ray", "normal", "opacity"):
+            assert np.array_equal(arrays[key], getattr(truth, key), equal_nan=True), key
+        assert np.array_equal(arrays["mask"], truth.opacity > 0.5)
+    exr = read_image(tmp_path / "exr/views/0000/ms.exr")
+    assert sorted(exr[9, 12]) == pytest.approx(sorted(truth.channels["ms"][9, 12]))
+    assert np.allclose(read_image(tmp_path / "tiff/views/0000/ms.tiff"), truth.channels["ms"], atol=1 / 65535)
+    assert np.array_equal(read_image(tmp_path / "tiff/views/0000/pol_stokes.tiff"), truth.stokes["pol"])
+
+
+def test_native_rig(tmp_path: Path) -> None:
+    field = AnalyticField(sphere())
+    generate_dataset(field, views_of(field), tmp_path, ["rgb", "polarization"], rig="native")  # type: ignore[arg-type]
+    pose = ring_pose(1, 7) @ field.rig["pol"]
+    truth = field.render(field.cameras["pol"], pose, ["pol"])
+    with np.load(tmp_path / "views/0001/pol.npz") as arrays:
+        assert np.array_equal(arrays["data"], truth.channels["pol"], equal_nan=True)
+    with np.load(tmp_path / "views/0001/geometry_pol.npz") as arrays:
+        assert np.array_equal(arrays["depth_z"], truth.depth_z, equal_nan=True)
+    assert np.allclose(read_poses(tmp_path / "transforms_pol.json")[1][1], pose)
+
+
+def test_transforms_come_back(tmp_path: Path) -> None:
+    field = AnalyticField(sphere())
+    generate_dataset(field, views_of(field), tmp_path)  # type: ignore[arg-type]
+    for (camera, pose, _), (read_camera, read_pose, _) in zip(views_of(field), read_poses(tmp_path / "transforms.json"), strict=True):
+        assert read_camera is not None
+        assert np.allclose(read_pose, pose, atol=1e-12) and np.allclose(read_camera.matrix, camera.matrix)
+        assert np.allclose(read_camera.coefficients, camera.coefficients)
+
+
+def test_resumes(tmp_path: Path) -> None:
+    """Finished views are kept; a missing, cut-off or foreign one is made again."""
+    field = AnalyticField(sphere())
+
+    def renders(radius: float = 0.6) -> int:
+        again = AnalyticField(sphere(radius))
+        generate_dataset(again, views_of(field, 3), tmp_path)  # type: ignore[arg-type]
+        return again.renders
+
+    assert renders() == 3
+    before = content(tmp_path)
+    assert renders() == 0
+    (tmp_path / "views/0000/view.json").unlink()
+    assert renders() == 1
+    (tmp_path / "views/0001/ms.npz").write_bytes(before["views/0001/ms.npz"][:-1])
+    assert renders() == 1
+    (tmp_path / "views/0002/view.json").write_text("{")
+    assert renders() == 1
+    assert content(tmp_path) == before
+    assert renders(0.5) == 3  # another field
+
+
+def test_verify_finds_damage(tmp_path: Path) -> None:
+    field = AnalyticField(sphere())
+    generate_dataset(field, views_of(field, 3), tmp_path)  # type: ignore[arg-type]
+    (tmp_path / "views/0000/rgb.npz").unlink()
+    damaged = bytearray((tmp_path / "views/0001/ms.npz").read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    (tmp_path / "views/0001/ms.npz").write_bytes(damaged)
+    (tmp_path / "views/0002/view.json").unlink()
+    problems = verify(tmp_path)
+    assert len(problems) == 3
+    for problem, name in zip(problems, ("0000/rgb.npz", "0001/ms.npz", "0002/view.json"), strict=True):
+        assert name in problem.replace("\\", "/")
+
+
+def test_refuses(tmp_path: Path) -> None:
+    field = AnalyticField(sphere())
+    views = views_of(field)
+    out = tmp_path / "out"
+    for arguments, message in [
+        ({"rig": "both"}, "aligned, native"),
+        ({"format": "jpg"}, "npz, exr, tiff"),
+        ({"modalities": ["thermal"]}, "'thermal'"),
+        ({"modalities": []}, "no modalities"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            generate_dataset(field, views, out, **arguments)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="no views"):
+        generate_dataset(field, [], out)  # type: ignore[arg-type]
+    del field.rig["pol"]
+    with pytest.raises(InputError, match="'pol' has no known place"):
+        generate_dataset(field, views, out, rig="native")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"dataset\.json"):
+        verify(out)
+    assert not out.exists()

@@ -1,0 +1,121 @@
+"""load_scene: picking the reader, refusing what cannot be learned from; describe and its text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from conftest import OPENCV_TO_OPENGL, look_at
+
+from mmsynth.errors import InputError
+from mmsynth.scene.info import describe, render_text
+from mmsynth.scene.load import load_scene
+
+Writer = Callable[..., Path]
+
+
+def test_picks_the_reader(write_mmsdata: Writer) -> None:
+    root = write_mmsdata()
+    assert load_scene(root).format == load_scene(str(root / "meta_data.json")).format == "MMS-DATA"
+
+
+def test_picks_nerfstudio(write_transforms: Writer) -> None:
+    root = write_transforms()
+    assert load_scene(root).format == load_scene(root / "transforms.json").format == "nerfstudio"
+
+
+def test_missing_and_unknown_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file or folder"):
+        load_scene(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"not a scene, expected meta_data\.json"):
+        load_scene(tmp_path)
+    (tmp_path / "calibration.json").write_text("{}")
+    with pytest.raises(InputError, match="no camera poses"):
+        load_scene(tmp_path)
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(InputError, match="not a scene"):
+        load_scene(tmp_path / "a.txt")
+
+
+def test_modalities_by_name_or_alias(write_mmsdata: Writer) -> None:
+    root = write_mmsdata()
+    assert list(load_scene(root, ["infrared"]).sensors) == list(load_scene(root, ["NIR"]).sensors) == ["nir"]
+    with pytest.raises(InputError, match="no modality 'thermal' in this scene, expected one of rgb, nir"):
+        load_scene(root, ["rgb", "thermal"])
+
+
+def test_broken_json_is_located(write_mmsdata: Writer) -> None:
+    root = write_mmsdata()
+    (root / "meta_data.json").write_text('{"raw": true,\n "modalities": }')
+    with pytest.raises(InputError, match=r"meta_data\.json: not valid JSON at line 2, column 16"):
+        load_scene(root)
+
+
+def test_scene_outside_the_region_is_refused(write_mmsdata: Writer) -> None:
+    def away(meta: dict[str, Any]) -> None:
+        for entry in meta["modalities"].values():
+            for frame in entry["frames"]:
+                position = np.array(frame["camtoworld"])[:, 3]
+                frame["camtoworld"] = (look_at(position, 2 * position) @ OPENCV_TO_OPENGL)[:3].tolist()
+
+    with pytest.raises(InputError, match="no camera sees the region of interest"):
+        load_scene(write_mmsdata(edit=away))
+
+
+def test_frames_that_look_elsewhere_are_a_problem(write_mmsdata: Writer) -> None:
+    def away(meta: dict[str, Any]) -> None:
+        frame = meta["modalities"]["infrared"]["frames"][1]
+        position = np.array(frame["camtoworld"])[:, 3]
+        frame["camtoworld"] = (look_at(position, 2 * position) @ OPENCV_TO_OPENGL)[:3].tolist()
+
+    problems = load_scene(write_mmsdata(edit=away)).problems
+    assert problems == ("1 of 8 frames do not see the region of interest, the first is nir view 1.",)
+
+
+def test_region_smaller_than_a_pixel_is_still_seen(write_mmsdata: Writer) -> None:
+    assert load_scene(write_mmsdata(edit=lambda meta: meta["scene_box"].update(radius=1e-6))).problems == ()
+
+
+def test_too_few_training_frames(write_transforms: Writer) -> None:
+    with pytest.raises(InputError, match=r"1 frames to train on \(2 in all\), expected at least 2"):
+        load_scene(write_transforms(count=2))
+
+
+def test_describe_is_json_and_text(write_mmsdata: Writer) -> None:
+    root = write_mmsdata(views=range(10))
+    (root / "modalities" / "rgb" / "0001.png").unlink()
+    description = describe(load_scene(root))
+    assert json.loads(json.dumps(description, allow_nan=False)) == description
+    rgb = description["sensors"]["rgb"]
+    assert (rgb["frames"], rgb["train"], rgb["test"], rgb["size"], rgb["bits"]) == (9, 8, 1, [24, 18], 16)
+    assert 0.4 < rgb["mean"] < 0.6 and rgb["invalid_lens_pixels"] == 0
+    text = render_text(description)
+    assert "mosaic 1 2 / 0 1" in text and "rgb: 1 of 10 frames have no image file" in text
+
+
+def test_describe_lists_damaged_files_once(write_mmsdata: Writer) -> None:
+    root = write_mmsdata(views=range(6))
+    path = root / "modalities" / "infrared" / "0003.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    problems = describe(load_scene(root))["problems"]
+    assert len(problems) == 1 and "0003.png: truncated PNG" in problems[0]
+
+
+def test_describe_counts_pixels_without_a_ray(write_mmsdata: Writer) -> None:
+    def fold(meta: dict[str, Any]) -> None:
+        meta["modalities"]["rgb"]["distortion_params"] = [-1.5, 0, 0, 0, 0, 0]
+
+    assert 0 < describe(load_scene(write_mmsdata(edit=fold)))["sensors"]["rgb"]["invalid_lens_pixels"] < 24 * 18
+
+
+def test_describe_suspects_right_aligned_data(write_mmsdata: Writer) -> None:
+    root = write_mmsdata()
+    for view in range(4):
+        codes = np.random.default_rng(view).integers(0, 4096, (18, 24), np.uint16)
+        cv2.imwrite(str(root / "modalities" / "infrared" / f"{view:04d}.png"), codes)
+    assert any("not left-aligned" in problem for problem in describe(load_scene(root))["problems"])

@@ -1,0 +1,163 @@
+"""Poses files, rigidity, and the region guessed from cameras."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import OPENCV_TO_OPENGL, look_at, ring
+
+from mmsynth.errors import InputError
+from mmsynth.scene.poses import read_poses, region_from_cameras, rigid
+from mmsynth.sensors.camera import Camera
+
+CAMERA = Camera(24, 18, 25.0, 25.0, 11.5, 8.5)
+
+
+def write_colmap(folder: Path, poses: list[np.ndarray], points: str = "\n") -> Path:
+    lines = ["# id qw qx qy qz tx ty tz camera name"]
+    for index, pose in enumerate(poses):
+        to_camera = np.linalg.inv(pose)
+        w, x, y, z = quaternion(to_camera[:3, :3])
+        tx, ty, tz = to_camera[:3, 3]
+        lines.append(f"{index + 1} {w} {x} {y} {z} {tx} {ty} {tz} 7 rgb/{index:04d}.png{points}".rstrip(" "))
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    return folder / "images.txt"
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion as the eigenvector of Bar-Itzhack's matrix: independent of the formula under test."""
+    r = rotation
+    matrix = np.array([
+        [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+        [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+        [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1]],
+    ])  # fmt: skip
+    return np.linalg.eigh(matrix)[1][:, -1]
+
+
+@pytest.mark.parametrize("points", ["\n", "\n1.5 2.5 -1 3.5 4.5 12", ""], ids=["empty line", "points", "no line"])
+def test_colmap(tmp_path: Path, points: str) -> None:
+    poses = ring(3)
+    path = write_colmap(tmp_path, poses, points)
+    assert [camera for camera, _, _ in read_poses(path)] == [None] * 3
+    (tmp_path / "cameras.txt").write_text("# cameras\n7 FULL_OPENCV 24 18 25 26 12 9 .1 .2 .3 .4 .5 .6 .7 .8\n")
+    found = read_poses(tmp_path)
+    assert [name for _, _, name in found] == ["0000", "0001", "0002"]
+    for (camera, pose, _), expected in zip(found, poses, strict=True):
+        assert camera == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
+        np.testing.assert_allclose(pose, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 1 0 0 nan 0 0 0 7 a.png", "not finite"),
+        ("1 2 0 0 0 0 0 0 7 a.png", "length 2"),
+        ("1 1 0 0 0 0 0 x 7 a.png", "not a number"),
+        ("1 1 0 0 0 0 0 0", "8 values"),
+    ],
+)
+def test_colmap_errors_name_the_line(tmp_path: Path, line: str, message: str) -> None:
+    (tmp_path / "images.txt").write_text(f"# comment\n{line}\n\n")
+    with pytest.raises(InputError, match=rf"images\.txt: line 2: .*{message}"):
+        read_poses(tmp_path / "images.txt")
+
+
+def test_colmap_fisheye_is_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path, ring(2))
+    (tmp_path / "cameras.txt").write_text("7 OPENCV_FISHEYE 24 18 25 26 12 9 0 0 0 0\n")
+    with pytest.raises(InputError, match=r"cameras\.txt: line 1"):
+        read_poses(tmp_path)
+
+
+def write_json(tmp_path: Path, content: Any) -> Path:
+    (tmp_path / "poses.json").write_text(json.dumps(content))
+    return tmp_path / "poses.json"
+
+
+def test_transforms_as_poses(tmp_path: Path) -> None:
+    frames = [{"file_path": f"out/{i}.png", "transform_matrix": (pose @ OPENCV_TO_OPENGL).tolist()} for i, pose in enumerate(ring(3))]
+    for found, expected in zip(read_poses(write_json(tmp_path, {"frames": frames})), ring(3), strict=True):
+        assert found[0] is None
+        np.testing.assert_allclose(found[1], expected, atol=1e-12)
+    shared = {"fl_x": 25.0, "w": 24, "h": 18, "frames": frames}
+    assert read_poses(write_json(tmp_path, shared))[2][0::2] == (CAMERA, "2")
+
+
+def test_camera_path(tmp_path: Path) -> None:
+    """The field of view is vertical, in degrees."""
+    fov = np.degrees(2 * np.arctan(18 / 2 / 25.0))
+    path = [{"camera_to_world": (pose @ OPENCV_TO_OPENGL).ravel().tolist(), "fov": fov, "aspect": 4 / 3} for pose in ring(2)]
+    content = {"camera_type": "perspective", "render_width": 24, "render_height": 18, "camera_path": path}
+    camera, pose, _ = read_poses(write_json(tmp_path, content))[1]
+    assert camera is not None and camera.fx == camera.fy == pytest.approx(25.0) and (camera.cx, camera.cy) == (11.5, 8.5)
+    np.testing.assert_allclose(pose, ring(2)[1], atol=1e-12)
+    content["camera_type"] = "equirectangular"
+    with pytest.raises(InputError, match="equirectangular"):
+        read_poses(write_json(tmp_path, content))
+
+
+def test_rig(tmp_path: Path) -> None:
+    content = {"convention": "OpenCV camera (x right, y down, z forward)", "rig": [pose.tolist() for pose in ring(2)]}
+    np.testing.assert_allclose(read_poses(write_json(tmp_path, content))[1][1], ring(2)[1], atol=1e-12)
+    content["rig"][1][0][3] = float("nan")
+    with pytest.raises(InputError, match=r"poses\.json: pose 1: .*not finite in row 0, column 3"):
+        read_poses(write_json(tmp_path, content))
+    content["convention"] = "OpenGL"
+    with pytest.raises(InputError, match="expected OpenCV axes"):
+        read_poses(write_json(tmp_path, content))
+
+
+@pytest.mark.parametrize("content", [[], {}, {"frames": []}, {"frames": 3}, {"rig": {}}, {"camera_path": [{}]}])
+def test_other_content_is_refused(tmp_path: Path, content: Any) -> None:
+    with pytest.raises(InputError, match=r"poses\.json"):
+        read_poses(write_json(tmp_path, content))
+
+
+@pytest.mark.parametrize("bad", [None, "x", [[1, 2], [3]], np.eye(3), np.diag([1, 1, 1, 2.0]), [[None] * 4] * 3])
+def test_rigid_refuses(bad: Any) -> None:
+    with pytest.raises(InputError, match=r"^here: "):
+        rigid(bad, "here")
+
+
+def test_region_of_a_ring_is_where_the_cameras_look() -> None:
+    shift = np.array([1e5, -2e5, 30.0])  # survey coordinates
+    poses = [pose.copy() for pose in ring(12)]
+    for pose in poses:
+        pose[:3, 3] += shift
+    region = region_from_cameras([CAMERA] * 12, poses)
+    np.testing.assert_allclose(region.centre, shift, atol=1e-6)
+    half_view = np.arctan(9 / 25)
+    assert region.radius == pytest.approx(np.sqrt(10) * np.sin(half_view), rel=1e-9)
+
+
+def test_region_leaves_the_nearest_camera_outside() -> None:
+    wide = Camera(24, 18, 5.0, 5.0, 11.5, 8.5)
+    poses = [*ring(8), look_at((0.0, 1.2, 0.4))]
+    region = region_from_cameras([wide] * 9, poses)
+    assert min(np.linalg.norm(pose[:3, 3] - region.centre) for pose in poses) > region.radius
+
+
+DEGENERATE: dict[str, Callable[[], list[np.ndarray]]] = {
+    "one camera": lambda: [look_at((3.0, 0.0, 1.0))],
+    "one camera twice": lambda: [look_at((3.0, 0.0, 1.0))] * 2,
+    "parallel axes": lambda: [look_at((3.0, y, 0.0), (0.0, y, 0.0)) for y in (0.0, 0.5, 1.0)],
+    "looking outwards": lambda: [look_at(pose[:3, 3], 2 * pose[:3, 3]) for pose in ring(8)],
+    "panorama": lambda: [look_at((0.0, 0.0, 0.0), (np.cos(a), np.sin(a), 0.0)) for a in np.arange(6)],
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_cameras_give_a_finite_region(name: str) -> None:
+    poses = DEGENERATE[name]()
+    region = region_from_cameras([CAMERA] * len(poses), poses)
+    assert np.isfinite([*region.centre, region.radius]).all() and 0.01 < region.radius < 100
+    if name == "one camera":
+        ahead = np.linalg.inv(poses[0]) @ [*region.centre, 1.0]
+        np.testing.assert_allclose(ahead[:3], (0, 0, 1), atol=1e-12)
