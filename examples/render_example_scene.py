@@ -492,8 +492,17 @@ def rig() -> list[RigSensor]:
         pose[:3, 3] = position
         return pose
 
-    def sensor(name: str, title: str, size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float],
-               brown: tuple[float, float, float, float], pattern: list[list[int]], place: np.ndarray, bits: int = 12) -> RigSensor:
+    def sensor(
+        name: str,
+        title: str,
+        size: tuple[int, int],
+        focal: tuple[float, float],
+        centre: tuple[float, float],
+        brown: tuple[float, float, float, float],
+        pattern: list[list[int]],
+        place: np.ndarray,
+        bits: int = 12,
+    ) -> RigSensor:
         # brown: k1 k2 p1 p2
         camera = Camera(*size, *focal, *centre, (*brown, 0.0, 0.0))
         return RigSensor(name, title, camera, np.array(pattern), place, curves[name], bits)

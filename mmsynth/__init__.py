@@ -1,3 +1,57 @@
-"""mmsynth: one radiance field of a scene from the raw frames of several sensors, and what no rig could capture from it."""
+"""mmsynth: one radiance field of a scene from the raw frames of several sensors, and what no rig could capture from it.
+
+The names below are loaded when first used, so that ``mmsynth --help`` does not wait for torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from mmsynth.errors import InputError
+    from mmsynth.field.field import Field, Rendering
+    from mmsynth.fitting.recipe import Recipe, load_recipe
+    from mmsynth.fitting.trainer import fit
+    from mmsynth.operations.convert import convert
+    from mmsynth.operations.dataset import generate_dataset
+    from mmsynth.operations.evaluate import evaluate
+    from mmsynth.operations.mesh import extract_mesh, write_mesh
+    from mmsynth.scene.load import load_scene
+
+_HOMES = {
+    "InputError": "errors",
+    "Field": "field.field",
+    "Rendering": "field.field",
+    "Recipe": "fitting.recipe",
+    "load_recipe": "fitting.recipe",
+    "fit": "fitting.trainer",
+    "convert": "operations.convert",
+    "generate_dataset": "operations.dataset",
+    "evaluate": "operations.evaluate",
+    "extract_mesh": "operations.mesh",
+    "write_mesh": "operations.mesh",
+    "load_scene": "scene.load",
+}
+__all__ = [
+    "Field",
+    "InputError",
+    "Recipe",
+    "Rendering",
+    "convert",
+    "evaluate",
+    "extract_mesh",
+    "fit",
+    "generate_dataset",
+    "load_recipe",
+    "load_scene",
+    "write_mesh",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mmsynth' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"mmsynth.{_HOMES[name]}"), name)

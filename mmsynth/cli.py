@@ -215,8 +215,8 @@ def convert(
 @command("generate-dataset")
 def generate_dataset(
     poses: Annotated[
-        Path, typer.Option(help="transforms.json, camera_path.json, COLMAP images.txt or a trajectory; looked for here, then in the scene")
-    ],
+        Path, typer.Option(help="transforms.json, camera_path.json, images.txt or a trajectory; sought here, then in the scene")
+    ] = Path("poses.json"),
     run: RunOption = None,
     rig: Annotated[
         str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")

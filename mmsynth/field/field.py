@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from mmsynth.errors import InputError
@@ -255,7 +255,8 @@ class Field(nn.Module):
     def save(self, run: Path) -> None:
         """Write ``field.safetensors`` and ``manifest.json`` into the run folder, each atomically, the manifest last."""
         tensors = {k: v.detach().cpu().contiguous() for k, v in self.state_dict().items()}
-        write_atomic(run / "field.safetensors", lambda path: save_file(tensors, path))
+        content = save(tensors)
+        write_atomic(run / "field.safetensors", lambda path: path.write_bytes(content))
         self.manifest["field"] = {
             "design": asdict(self.design),
             "sampling": asdict(self.sampling),
@@ -300,6 +301,7 @@ class Field(nn.Module):
 def _sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     out = asdict(sensor)
     out["mosaic"] = None if sensor.mosaic is None else sensor.mosaic.tolist()
+    out["saturation"] = sensor.saturation if np.isfinite(sensor.saturation) else None  # float images never clip; JSON has no inf
     return json.loads(json.dumps(out))
 
 
@@ -311,5 +313,5 @@ def _sensor_from_json(stored: dict[str, Any]) -> Sensor:
         wavelengths_nm=tuple(stored["wavelengths_nm"]),
         mosaic=None if stored["mosaic"] is None else np.array(stored["mosaic"]),
         polarizer_angles_deg=None if angles is None else tuple(angles),
-        saturation=stored["saturation"],
+        saturation=float("inf") if stored["saturation"] is None else stored["saturation"],
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ _NAME = "state.pt"
 
 def write_checkpoint(run: Path, state: dict[str, Any]) -> None:
     """Replace the run's checkpoint. ``state`` holds tensors, numbers, strings and containers of them."""
-    write_atomic(run / "checkpoint" / _NAME, lambda path: torch.save(state, path))
+    content = io.BytesIO()  # torch's own file writer answers a full disk with an internal error
+    torch.save(state, content)
+    write_atomic(run / "checkpoint" / _NAME, lambda path: path.write_bytes(content.getbuffer()))
 
 
 def read_checkpoint(run: Path) -> dict[str, Any] | None:

@@ -64,8 +64,9 @@ class Measurements:
         self.counts = np.array([_count(self.usable[c], self.directions[c]) for c in self.camera_index])
         self.ends = np.cumsum(self.counts)
         self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
-        self.level = float(np.mean([_decode(v).mean() for v in values]))
         self.has_alpha = any(a is not None for a in alphas)
+        drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
+        self.level = float(self.read(drawn, pixel)[0].mean())
 
     def pick(self, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """``count`` pixels, uniform over all frames with replacement, sorted by frame: frame and pixel indices, (count,) each."""
@@ -87,14 +88,15 @@ class Measurements:
         return self.origins[frame], np.einsum("nij,nj->ni", self.rotations[frame], in_camera)
 
     def read(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Values (N, K) and alpha (N,) or None, float32."""
+        """Values (N, K) and alpha (N,) or None, float32. With alpha, values are premultiplied: what the object adds to black."""
         starts = np.flatnonzero(np.r_[True, frame[1:] != frame[:-1]])
         runs = list(zip(starts, np.r_[starts[1:], len(frame)], strict=True))
         target = np.concatenate([_decode(self.values[frame[a]][pixel[a:b]]) for a, b in runs])
         if not self.has_alpha:
             return target, None
         alpha = [np.ones(b - a, np.float32) if (m := self.alphas[frame[a]]) is None else _decode(m[pixel[a:b]]) for a, b in runs]
-        return target, np.concatenate(alpha)
+        opacity = np.concatenate(alpha)
+        return target * opacity[:, None], opacity
 
     def batch(self, count: int, random: np.random.Generator, device: torch.device) -> Batch:
         """A random batch of ``count`` rays."""

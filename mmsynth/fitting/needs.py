@@ -56,6 +56,11 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     radiance_finest = int(np.clip(recipe.radiance_cells / footprint, 64, 2048))
     cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
     evidence["resolution"] = f"a pixel is {footprint:.2g} radii at the centre: {cells}"
+    # measured: before a background a small sphere leaves the scene to the background; alone, a large one is painted and stays
+    radius = recipe.initial_radius or (0.5 if background else 0.15)
+    evidence["initial_sphere"] = (
+        f"radius {radius:g}: {'asked for by the recipe' if recipe.initial_radius else 'background ' + ('on' if background else 'off')}"
+    )
     pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
     evidence["tensor_head"] = f"on: {', '.join(pol)}" if pol else "off: no polarization sensor"
     design = Design(
@@ -70,7 +75,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         surface_hidden=recipe.surface_hidden,
         radiance_hidden=recipe.radiance_hidden,
         occupancy=recipe.occupancy_resolution,
-        initial_radius=recipe.initial_radius,
+        initial_radius=radius,
     )
     black = not background and outside >= 0.005
     return Needs(design, footprint, max(recipe.sharpness_end / footprint, 2 * recipe.sharpness_start), black, evidence)

@@ -316,10 +316,10 @@ def fit(
             last_logged = now
         if now - last_saved > CHECKPOINT_SECONDS:
             write_checkpoint(run, trainer.checkpoint())
-            write_text(run / "train.jsonl", "\n".join(log) + "\n")
+            write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
             last_saved = time.perf_counter()
     write_checkpoint(run, trainer.checkpoint())
-    write_text(run / "train.jsonl", "\n".join(log) + "\n")
+    write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
     return _finish(trainer, scene, run)
 
 

@@ -303,6 +303,8 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def write_tiff16(path: Path, image: np.ndarray) -> None:
     """Write (H, W) or (H, W, C) values in [0, 1] as 16-bit TIFF (zlib, any channel count); rounding as ``to_uint16``."""
     pixels = to_uint16(image)
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
     photometric = "rgb" if pixels.ndim == 3 and pixels.shape[2] == 3 else "minisblack"
     planar = "contig" if pixels.ndim == 3 else None
     write_atomic(

@@ -63,7 +63,7 @@ def test_scene_outside_the_region_is_refused(write_mmsdata: Writer) -> None:
                 position = np.array(frame["camtoworld"])[:, 3]
                 frame["camtoworld"] = (look_at(position, 2 * position) @ OPENCV_TO_OPENGL)[:3].tolist()
 
-    with pytest.raises(InputError, match="no camera sees the region of interest"):
+    with pytest.raises(InputError, match="do not see the region of interest"):
         load_scene(write_mmsdata(edit=away))
 
 
