@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -192,7 +193,7 @@ class Trainer:
         """All state, as tensors and numbers."""
         return {
             "version": 1,
-            "task": self.task(),
+            "task": self.task,
             "field": self.field.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "state": vars(self.state).copy(),
@@ -206,7 +207,7 @@ class Trainer:
         Raises:
             InputError: it belongs to another scene, recipe, seed or length.
         """
-        ours, theirs = self.task(), saved["task"]
+        ours, theirs = self.task, saved["task"]
         for key, value in ours.items():
             if theirs.get(key) != value:
                 raise InputError(
@@ -217,8 +218,9 @@ class Trainer:
         self.state = _State(**saved["state"])
         self.mean_loss, self.mean_error = saved["mean_loss"], dict(saved["mean_error"])
 
+    @functools.cached_property
     def task(self) -> dict[str, Any]:
-        """What a checkpoint must agree on to be resumed."""
+        """What a checkpoint must agree on to be resumed: hash of the pixels and poses, recipe, seed, length."""
         digest = hashlib.sha256()
         for name, m in self.measurements.items():
             digest.update(name.encode())
@@ -276,17 +278,21 @@ def fit(
     """Learn the field of a scene and write it into a run folder.
 
     Args:
-        steps: length in optimiser steps, or ``budget``: length in seconds of training; 60 s when both are None.
+        steps: length in optimiser steps, or ``budget``: length in seconds of training; when both are None, what a resumed
+            checkpoint was planned for, else 60 s.
         resume: go on from the run's checkpoint, if it has one.
         on_start: called once with what the scene was found to need. on_step: called after every step.
     Raises:
         InputError: the scene cannot be read, the run folder cannot be written, or a checkpoint does not fit.
     """
+    saved = read_checkpoint(run) if resume else None
     if steps is None and budget is None:
-        budget = 60.0
+        planned = saved["task"] if saved else {}
+        steps, budget = planned.get("steps") or None, planned.get("budget") or None
+        if steps is None and budget is None:
+            budget = 60.0
     kernels.announce_compilation()
     trainer = Trainer(scene, recipe or load_recipe(None), steps, budget, seed, device)
-    saved = read_checkpoint(run) if resume else None
     log: list[str] = []
     if saved is not None:
         trainer.restore(saved)
@@ -334,7 +340,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
         "scene": {
             "path": str(scene.root.resolve()),
             "format": scene.format,
-            "hash": trainer.task()["scene"],
+            "hash": trainer.task["scene"],
             "test_views": list(scene.split.test),
         },
         "recipe": trainer.recipe.model_dump(),

@@ -41,7 +41,8 @@ def load_scene(path: Path | str, modalities: Sequence[str] | None = None) -> Sce
     if len(blind) > 0.75 * len(scene.frames):
         # poses and region in different frames: the few that still see it do so by accident
         raise InputError(
-            f"{path}: {len(blind)} of {len(scene.frames)} frames do not see the region of interest (centre {_rounded(scene.region.centre)}, radius {scene.region.radius:.4g}), "
+            f"{path}: {len(blind)} of {len(scene.frames)} frames do not see the region of interest "
+            f"(centre {_rounded(scene.region.centre)}, radius {scene.region.radius:.4g}), "
             "expected poses and region in one frame."
         )
     if blind:

@@ -67,7 +67,7 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, mo
         fit(scene, tmp_path / "cut", SMALL, steps=24, seed=3, on_step=kill)
     assert not (tmp_path / "cut" / "manifest.json").exists()
     steps = []
-    resumed = fit(scene, tmp_path / "cut", SMALL, steps=24, seed=3, resume=True, on_step=lambda n: steps.append(n.step))
+    resumed = fit(scene, tmp_path / "cut", SMALL, seed=3, resume=True, on_step=lambda n: steps.append(n.step))
     assert steps[0] == 13 and steps[-1] == 24  # the checkpoint of step 12 was the last before the kill
     for name, value in _tensors(resumed).items():
         assert torch.equal(value, whole[name]), name
