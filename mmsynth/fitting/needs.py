@@ -20,7 +20,11 @@ from mmsynth.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Needs:
-    """The choice and why: ``footprint`` is a pixel's size at the region's centre, in radii; ``evidence`` one line per choice."""
+    """The choice and why.
+
+    Attributes:
+        footprint: the finest detail to expect at the region's centre, in radii. evidence: one line per choice.
+    """
 
     design: Design
     footprint: float
@@ -32,9 +36,16 @@ class Needs:
         return asdict(self)
 
 
-def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, seed: int) -> Needs:
-    """Look at the cameras and at 4096 random pixels per modality."""
-    footprint = _footprint(measurements)
+def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, seed: int, rays_to_come: float) -> Needs:
+    """Look at the cameras and at 4096 random pixels per modality.
+
+    Args:
+        rays_to_come: about how many rays the fit will see. When that is fewer than there are pixels, what it can learn is
+            coarser than a pixel, by the square root of the ratio.
+    """
+    pixels = sum(int(m.ends[-1]) for m in measurements.values())
+    coarser = max(1.0, math.sqrt(pixels / rays_to_come))
+    footprint = _footprint(measurements) * coarser
     outside, bright, rays = _look_outside(measurements, np.random.default_rng((seed, 7)))
     evidence = {}
     if recipe.background != "auto":
@@ -55,7 +66,8 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     surface_finest = int(np.clip(recipe.surface_cells / footprint, 32, 1024))
     radiance_finest = int(np.clip(recipe.radiance_cells / footprint, 64, 2048))
     cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
-    evidence["resolution"] = f"a pixel is {footprint:.2g} radii at the centre: {cells}"
+    seen = f", {coarser:.1f} pixels apart for {rays_to_come:.1e} rays on {pixels:.1e} pixels" if coarser > 1 else ""
+    evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}"
     # measured: before a background a small sphere leaves the scene to the background; alone, a large one is painted and stays
     radius = recipe.initial_radius or (0.5 if background else 0.15)
     evidence["initial_sphere"] = (

@@ -74,7 +74,7 @@ class Trainer:
         self.device = torch.device(device)
         torch.manual_seed(seed)
         self.measurements: dict[str, Measurements] = load_measurements(scene)
-        self.needs: Needs = assess(scene, self.measurements, recipe, seed)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed, self._rays_to_come())
         sensors = {n: m.sensor for n, m in self.measurements.items()}
         levels = {n: m.level for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
@@ -97,6 +97,10 @@ class Trainer:
         if self.steps is not None:
             return min(1.0, self.state.step / self.steps)
         return min(1.0, self.state.elapsed / self.budget)  # type: ignore[operator]
+
+    def _rays_to_come(self) -> float:
+        """Rays that the fit will see, about: a constant per step or second, so that the design does not depend on the clock."""
+        return self.steps * self.recipe.samples_per_step / 10 if self.steps is not None else (self.budget or 0.0) * 30_000
 
     def run_step(self) -> None:
         """One optimiser step."""

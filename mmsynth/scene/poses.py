@@ -87,13 +87,13 @@ def rigid(matrix: Any, where: str, tolerance: float = 1e-4) -> np.ndarray:
 def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) -> Region:
     """Guess the region of interest of a scene that does not state it.
 
-    Centre: the point nearest to all optical axes (least squares). Radius: the ball there that just fits a frame, median over
-    the cameras of distance x sin(half the smaller field of view), but at most 0.9 of the distance to the nearest camera, so
+    Centre: the point nearest to all optical axes (least squares). Radius: the ball there that just fills a frame, median over
+    the cameras of distance x sin(half the larger field of view), but at most 0.9 of the distance to the nearest camera, so
     that cameras stay outside; a stray camera nearer than 1/9 of the median does not shrink it further.
 
     Where the axes have no common point in front of most cameras (one camera, parallel axes, looking outwards), the ball is
     put ahead of the cameras' mean position, along their mean direction, at twice their spread (1 unit for a single
-    position), and fits a frame as above; a panorama without mean direction gets a ball of that distance around itself.
+    position), and fills a frame as above; a panorama without mean direction gets a ball of that distance around itself.
 
     Args:
         cameras, poses: one per frame; poses (4, 4), OpenCV axes.
@@ -125,8 +125,8 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
 
 
 def _half_view(camera: Camera) -> float:
-    """Half the smaller field of view, in radians."""
-    return float(np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
+    """Half the larger field of view, in radians."""
+    return float(np.arctan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
 
 
 def _triple(point: np.ndarray) -> tuple[float, float, float]:

@@ -171,3 +171,12 @@ def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Calla
     values, opacity = m.read(np.zeros(alpha.size, np.int64), np.arange(alpha.size))
     np.testing.assert_allclose(opacity, alpha.ravel(), atol=1e-6)
     np.testing.assert_allclose(values, (pixels * alpha[..., None]).reshape(-1, 3), atol=1e-6)
+
+
+def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene) -> None:
+    long, short = (Trainer(scene, SMALL, steps, None, 0, "cpu").needs for steps in (100_000, 20))
+    cameras = [f.camera for f in scene.frames]
+    distance = np.median([np.linalg.norm(f.camera_to_world[:3, 3] - scene.region.centre) for f in scene.frames]) / scene.region.radius
+    assert long.footprint == pytest.approx(distance / np.median([c.fx for c in cameras]), rel=0.02)
+    assert short.footprint > 2 * long.footprint
+    assert short.design.surface_finest <= long.design.surface_finest and short.sharpness_end < long.sharpness_end

@@ -133,7 +133,7 @@ def test_region_of_a_ring_is_where_the_cameras_look() -> None:
         pose[:3, 3] += shift
     region = region_from_cameras([CAMERA] * 12, poses)
     np.testing.assert_allclose(region.centre, shift, atol=1e-6)
-    half_view = np.arctan(9 / 25)
+    half_view = np.arctan(12 / 25)
     assert region.radius == pytest.approx(np.sqrt(10) * np.sin(half_view), rel=1e-9)
 
 
