@@ -40,5 +40,5 @@ def section_weights(sdf: Tensor, sharpness: float, offsets: Tensor) -> tuple[Ten
 def announce_compilation() -> None:
     """Compile the CPU kernels now if they never were, and say so: it happens once per machine."""
     if not cpu.is_compiled():
-        print("compiling kernels once, ~30 s ...", file=sys.stderr, flush=True)
+        print("compiling kernels once, ~10 s ...", file=sys.stderr, flush=True)
     cpu.compile_all()
