@@ -96,14 +96,20 @@ def _bar(title: str, quiet: bool) -> Iterator[Callable[..., None]]:
         yield lambda done, total, news="": progress.update(task, completed=done, total=total, news=news)
 
 
-def _load(run: Path | None) -> tuple[Path, Any, Any]:
-    """Run folder, field, and the scene it was fitted to."""
+def _load_field(run: Path | None) -> tuple[Path, Any]:
+    """Run folder and its field."""
     from mmsynth.field.field import Field
     from mmsynth.runs import finished_run
-    from mmsynth.scene.load import load_scene
 
     path = finished_run(run)
-    field = Field.load(path)
+    return path, Field.load(path)
+
+
+def _load(run: Path | None) -> tuple[Path, Any, Any]:
+    """Run folder, field, and the scene it was fitted to."""
+    from mmsynth.scene.load import load_scene
+
+    path, field = _load_field(run)
     return path, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))
 
 
@@ -202,9 +208,10 @@ def convert(
 ) -> None:
     """Another modality at the poses of the frames of one."""
     from mmsynth.operations.convert import convert as convert_frames
+    from mmsynth.scene.scene import canonical_modality
 
     folder, field, scene = _load(run)
-    (a,), (b,) = _names(source) or [""], _names(target) or [""]
+    a, b = canonical_modality(source), canonical_modality(target)
     chosen = _views(views)
     destination = out or folder / "convert" / f"{a}_to_{b}"
     with _bar(f"{a} to {b}", as_json) as show:
@@ -256,7 +263,7 @@ def mesh(
     """The surface, in the input's frame and unit."""
     from mmsynth.operations.mesh import extract_mesh, write_mesh
 
-    folder, field, _ = _load(run)
+    folder, field = _load_field(run)
     destination = out or folder / "mesh.ply"
     with _bar("mesh", as_json) as show:
         surface = extract_mesh(field, resolution, progress=show)

@@ -31,7 +31,8 @@ def write_atomic(path: Path, write: Callable[[Path], Any]) -> None:
             os.fsync(stream.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(f"{path}: could not be written ({error.strerror or error}).") from error
+        reason = error.strerror or str(error).replace(str(temporary), path.name)
+        raise InputError(f"{path}: could not be written ({reason}).") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()

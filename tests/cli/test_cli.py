@@ -153,6 +153,7 @@ def test_commands_without_a_fit_are_refused(tmp_path: Path) -> None:
 def test_bad_requests_on_a_run_are_refused(fitted: Path) -> None:
     refused(run(fitted, "convert", "--from", "rgb", "--to", "thermal"), "thermal", "ms")
     refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--views", "777"), "777")
+    refused(run(fitted, "convert", "--from", "rgb,ms", "--to", "pol"), "rgb,ms")
     refused(run(fitted, "generate-dataset", "--poses", "missing.json"), "missing.json")
     refused(run(fitted, "mesh", "--out", "mesh.xyz", "--resolution", "16"), "mesh.xyz")
     (fitted / "nan.json").write_text('{"convention": "OpenCV", "rig": [[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]}')
