@@ -157,7 +157,7 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def render_rays(
-        self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool, stokes: bool = True
+        self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
         """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth, normal."""
         rays = len(origins)
@@ -176,8 +176,7 @@ class Field(nn.Module):
             behind_analysers = values(name, axes, everything)
             out[name] = behind_analysers[:, :-3]
             i0, i45, i90 = behind_analysers[:, -3:].unbind(1)
-            if stokes:
-                out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
+            out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
         if geometry:
             depth = rendering.median_depth(hits, rays)
             hit = torch.nonzero(torch.isfinite(depth))[:, 0]

@@ -43,15 +43,14 @@ class Measurements:
     def __init__(self, sensor: Sensor, frames: tuple[Frame, ...], region: Region) -> None:
         self.sensor = sensor
         self.cameras: list[Camera] = list(dict.fromkeys(f.camera for f in frames))
-        values, alphas, kept = [], [], []
+        values, alphas = [], []
         for frame in frames:
             pixels, alpha = load_frame(sensor, frame)
             values.append(_compact(pixels.reshape(-1, 1 if pixels.ndim == 2 else pixels.shape[2])))
             alphas.append(None if alpha is None else _compact(alpha.reshape(-1)))
-            kept.append(frame)
         self.values, self.alphas = values, alphas
-        self.camera_index = np.array([self.cameras.index(f.camera) for f in kept])
-        poses = np.stack([f.camera_to_world for f in kept])
+        self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
+        poses = np.stack([f.camera_to_world for f in frames])
         self.rotations = poses[:, :3, :3].astype(np.float32)
         self.origins = ((poses[:, :3, 3] - np.array(region.centre)) / region.radius).astype(np.float32)
         self.directions, self.usable = [], []
