@@ -99,9 +99,9 @@ def _bar(title: str, quiet: bool) -> Iterator[Callable[..., None]]:
 def _load_field(run: Path | None) -> tuple[Path, Any]:
     """Run folder and its field."""
     from mmsynth.field.field import Field
-    from mmsynth.runs import finished_run
+    from mmsynth.runs import chosen_run
 
-    path = finished_run(run)
+    path = chosen_run(run)
     return path, Field.load(path)
 
 

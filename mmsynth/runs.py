@@ -39,14 +39,15 @@ def mark_latest(run: Path) -> None:
     os.replace(temporary, link)
 
 
-def finished_run(run: Path | None) -> Path:
+def chosen_run(run: Path | None) -> Path:
     """The given run, or the latest one in this folder.
 
     Raises:
-        InputError: there is no such finished run.
+        InputError: none was given and nothing was fitted in this folder.
     """
-    path = run or _RUNS / "latest"
-    if not (path / "manifest.json").is_file():
-        what = f"{path}: holds no finished fit (no manifest.json)" if run else "runs/latest: no finished fit in this folder"
-        raise InputError(f"{what}; run `mmsynth fit SCENE` first.")
-    return path
+    if run is not None:
+        return run  # whether it is finished is for Field.load to find
+    latest = _RUNS / "latest"
+    if not latest.is_dir():
+        raise InputError(f"{latest}: no finished fit in this folder; run `mmsynth fit SCENE` first.")
+    return latest

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from mmsynth.errors import InputError
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.background import Background
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.occupancy import Occupancy
@@ -294,6 +294,7 @@ class Field(nn.Module):
         except (OSError, SafetensorError, RuntimeError) as error:
             raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
         field.manifest = manifest
+        kernels.announce_compilation()  # a run may have been fitted on another machine
         return field.to(device)
 
 

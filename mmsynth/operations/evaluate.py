@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -280,8 +279,6 @@ def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, pro
     ours: list[np.ndarray] = []
     true: list[np.ndarray] = []
     rays, seconds = 0, 0.0
-    # kernels are compiled at their first call, which says nothing about their speed
-    field.render(replace(frames[0].camera, width=4, height=4), frames[0].camera_to_world, [frames[0].sensor], geometry=True)
     for frame in frames:
         sensor, mine = field.sensors[frame.sensor], scores[frame.sensor]
         started = time.perf_counter()

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from conftest import look_at
 
-from mmsynth.errors import InputError
-from mmsynth.field.field import Rendering
+from mmsynth.field.field import Field, Rendering
 from mmsynth.scene.images import write_npz, write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera, ray_map
@@ -63,12 +62,7 @@ class AnalyticField:
         self.largest_query = max(self.largest_query, len(points))
         return self.distance(np.asarray(points, float)).astype(np.float32)
 
-    def check_modalities(self, modalities: Sequence[str] | None) -> list[str]:
-        names = list(self.sensors) if modalities is None else list(modalities)
-        for name in names:
-            if name not in self.sensors:
-                raise InputError(f"modality {name!r}: not in this field, expected one of {', '.join(self.sensors)}.")
-        return names
+    check_modalities = Field.check_modalities
 
     def normal(self, p: np.ndarray) -> np.ndarray:
         step = 1e-4 * np.eye(3)
