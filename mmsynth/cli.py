@@ -21,16 +21,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Learn one radiance field of a scene from several sensors; then convert, generate, mesh.",
 )
+bench_app = typer.Typer(no_args_is_help=True, help="Measure speed against error: a table, a plot and JSON, in bench/NAME or --out.")
+app.add_typer(bench_app, name="bench")
 RunOption = Annotated[Path | None, typer.Option("--run", help="run folder; default: the last fit made in this folder")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object on stdout and nothing else there")]
 SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="scene folder, or `example` for the packaged scene")]
+RecipeOption = Annotated[str | None, typer.Option(help="packaged recipe or TOML file")]
+ModalitiesOption = Annotated[str | None, typer.Option(help="fit these only, e.g. rgb,ms")]
+FramesOption = Annotated[str | None, typer.Option(help="training frames to keep of some modalities, e.g. pol=3,ms=5; default: all")]
 
 
-def command(name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a command whose ``InputError`` becomes one sentence on stderr and exit code 2."""
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
-        @app.command(name)
+        @of.command(name)
         @functools.wraps(function)
         def guarded(*args: Any, **kwargs: Any) -> None:
             try:
@@ -61,10 +66,29 @@ def _views(text: str | None) -> tuple[int, ...] | None:
     return tuple(int(v) for v in text.split(","))
 
 
-def _seconds(text: str) -> float:
+def _frames(text: str | None) -> dict[str, int]:
+    from mmsynth.scene.scene import canonical_modality
+
+    limits: dict[str, int] = {}
+    for part in text.split(",") if text is not None else ():
+        match = re.fullmatch(r"\s*([^=\s]+)\s*=\s*(\d+)\s*", part)
+        name = canonical_modality(match[1]) if match else ""
+        if not match or name in limits:
+            raise InputError(f"--frames {text!r}: expected a number of frames per modality, each once, such as pol=3,ms=5.")
+        limits[name] = int(match[2])
+    return limits
+
+
+def _seeds(text: str) -> list[int]:
+    if not re.fullmatch(r"\d+(,\d+)*", text):
+        raise InputError(f"--seeds {text!r}: expected numbers such as 0,1.")
+    return [int(seed) for seed in text.split(",")]
+
+
+def _seconds(text: str, option: str = "--budget") -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|h)?", text.strip())
     if not match or float(match[1]) <= 0:
-        raise InputError(f"--budget {text!r}: expected a time such as 60s, 5m or 1h.")
+        raise InputError(f"{option} {text!r}: expected a time such as 60s, 5m or 1h.")
     return float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2] or "s"]
 
 
@@ -127,8 +151,9 @@ def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
 def fit(
     scene: SceneArgument,
     run: RunOption = None,
-    recipe: Annotated[str | None, typer.Option(help="packaged recipe or TOML file")] = None,
-    modalities: Annotated[str | None, typer.Option(help="fit these only, e.g. rgb,ms")] = None,
+    recipe: RecipeOption = None,
+    modalities: ModalitiesOption = None,
+    frames: FramesOption = None,
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
@@ -144,11 +169,12 @@ def fit(
     from mmsynth.report.report import write_report
     from mmsynth.runs import mark_latest, new_run, run_to_resume
     from mmsynth.scene.load import load_scene
+    from mmsynth.scene.scene import keep_frames
 
     if steps is not None and budget is not None:
         raise InputError("--steps and --budget: give one of the two.")
     seconds = _seconds(budget) if budget else None
-    loaded = load_scene(_scene_path(scene), _names(modalities))
+    loaded = keep_frames(load_scene(_scene_path(scene), _names(modalities)), _frames(frames))
     name = loaded.root.resolve().name
     folder = run or (run_to_resume(name) if resume else new_run(name))
 
@@ -282,6 +308,75 @@ def doctor(as_json: JsonOption = False) -> None:
 
     facts = diagnose()
     print(json.dumps(facts) if as_json else render_text(facts))
+
+
+@command("fit", of=bench_app)
+def bench_fit(
+    scene: SceneArgument,
+    budgets: Annotated[str, typer.Option(help="training times, one fit from scratch for each")] = "15s,30s,60s,2m,5m,10m",
+    recipe: RecipeOption = None,
+    modalities: ModalitiesOption = None,
+    frames: FramesOption = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/fit"),
+    as_json: JsonOption = False,
+) -> None:
+    """Error over time: a fit from scratch per time budget, each in a process of its own."""
+    from mmsynth.bench.fit import bench_fit as measure
+    from mmsynth.fitting.recipe import load_recipe
+
+    times = [_seconds(text, "--budgets") for text in budgets.split(",")]
+    with _bar("bench fit", as_json) as show:
+        report = measure(_scene_path(scene), times, out, load_recipe(recipe), _names(modalities), _frames(frames), seed, progress=show)
+    _print_report(report, as_json)
+
+
+@command("kernels", of=bench_app)
+def bench_kernels(
+    samples: Annotated[int, typer.Option(min=64, help="samples per call")] = 65536,
+    threads: Annotated[int | None, typer.Option(min=1, help="default: those of torch and numba")] = None,
+    out: Annotated[Path, typer.Option()] = Path("bench/kernels"),
+    as_json: JsonOption = False,
+) -> None:
+    """Every backend of every kernel: ns per sample, error against float64, share of the machine's bandwidth."""
+    from mmsynth.bench.kernels import bench_kernels as measure
+
+    with _bar("bench kernels", as_json) as show:
+        report = measure(samples, out, threads, progress=show)
+    _print_report(report, as_json)
+
+
+@command("ablation", of=bench_app)
+def bench_ablation(
+    scene: SceneArgument,
+    table: Annotated[str, typer.Option(help="engine, modalities, transfer, or a TOML file of variants")] = "engine",
+    steps: Annotated[int | None, typer.Option(min=1, help="length of every fit in optimiser steps")] = None,
+    budget: Annotated[str | None, typer.Option(help="or its time; default 60s")] = None,
+    seeds: Annotated[str, typer.Option(help="every variant is fitted with each, e.g. 0,1,2")] = "0",
+    only: Annotated[str | None, typer.Option(help="names of variants; the baseline is added")] = None,
+    out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/ablation"),
+    as_json: JsonOption = False,
+) -> None:
+    """What each choice is worth: variants of a fit against a baseline, in seconds and dB."""
+    from mmsynth.bench.ablation import bench_ablation as measure
+
+    if steps is not None and budget is not None:
+        raise InputError("--steps and --budget: give one of the two.")
+    seconds = _seconds(budget or "60s") if steps is None else None
+    chosen = None if only is None else [name.strip() for name in only.split(",")]
+    with _bar("bench ablation", as_json) as show:
+        report = measure(_scene_path(scene), table, out, steps, seconds, _seeds(seeds), chosen, progress=show)
+    _print_report(report, as_json)
+
+
+def _print_report(report: Any, as_json: bool) -> None:
+    from mmsynth.bench.tables import print_tables
+
+    if as_json:
+        print(json.dumps(report.results | {"out": str(report.out)}))
+        return
+    print_tables(report.tables)
+    print(f"wrote {report.out}/ (results.json, report.md, plot.svg)")
 
 
 def _tell(destination: Path, written: list[Path], as_json: bool) -> None:

@@ -10,12 +10,13 @@ Conventions (every reader converts to these, every writer from these):
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from mmsynth.errors import InputError
 from mmsynth.sensors.camera import Camera
 
 ALIASES = {
@@ -143,3 +144,27 @@ class Scene:
     def frames_of(self, sensor: str, views: tuple[int, ...] | None = None) -> tuple[Frame, ...]:
         """Frames of one sensor, optionally of some views only, in view order."""
         return tuple(f for f in self.frames if f.sensor == sensor and (views is None or f.view in views))
+
+
+def keep_frames(scene: Scene, limits: Mapping[str, int]) -> Scene:
+    """The same scene with at most N training frames of some modalities, evenly spread over its training views.
+
+    Test frames and the other modalities are untouched.
+
+    Args:
+        limits: modality (name or alias) → N; a modality that has no more than N keeps all of them.
+    Raises:
+        InputError: the scene has no such modality, or N < 1.
+    """
+    dropped: set[tuple[str, int]] = set()
+    for given, count in limits.items():
+        name = canonical_modality(given)
+        if name not in scene.sensors:
+            raise InputError(f"{scene.root}: no modality {given!r}, expected one of {', '.join(scene.sensors)}.")
+        if count < 1:
+            raise InputError(f"{name}: {count} training frames to keep, expected at least 1.")
+        views = [frame.view for frame in scene.frames_of(name, scene.split.train)]
+        # the middle of each of N equal stretches
+        kept = {views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)} if count < len(views) else set(views)
+        dropped |= {(name, view) for view in views if view not in kept}
+    return replace(scene, frames=tuple(f for f in scene.frames if (f.sensor, f.view) not in dropped))

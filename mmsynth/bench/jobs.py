@@ -1,0 +1,173 @@
+"""Fits to be measured, each in a process of its own, each result on disk as soon as it is there.
+
+A result lies in ``OUT/rows/<name>-<digest>.json``, and the digest is that of everything the result depends on (``identity``): pixels,
+poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result that is there is the result, and a
+bench that was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mmsynth
+from mmsynth.bench.machine import identify
+from mmsynth.errors import InputError
+from mmsynth.files import read_json, write_json
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.operations.progress import Progress
+from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import Scene, keep_frames
+
+_PACKAGE = Path(mmsynth.__file__).parent
+# what a fit and its score run through
+_CODE = ("field", "fitting", "scene", "sensors", "operations/evaluate.py", "bench/worker.py")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One fit from scratch and its score.
+
+    Attributes:
+        name: unique in its bench; names the file of the result. scene: folder or JSON file.
+        modalities: names to fit; None: all. frames: modality → training frames to keep (``keep_frames``).
+        steps, budget: length in optimiser steps, or in seconds; one of the two.
+    """
+
+    name: str
+    scene: str
+    recipe: Recipe
+    modalities: tuple[str, ...] | None
+    frames: Mapping[str, int]
+    seed: int
+    steps: int | None
+    budget: float | None
+
+    def task(self) -> dict[str, Any]:
+        """What the child process has to do, ready for JSON."""
+        return {**{k: v for k, v in asdict(self).items() if k not in ("name", "recipe")}, "recipe": self.recipe.model_dump()}
+
+
+def scene_of(task: Mapping[str, Any]) -> Scene:
+    """The scene of a ``Job.task``, with its modalities and frames alone.
+
+    Raises:
+        InputError: no such scene, modality or number of frames.
+    """
+    return keep_frames(load_scene(Path(task["scene"]), task["modalities"]), task["frames"])
+
+
+def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -> Iterator[dict[str, Any]]:
+    """The result of every job in turn: read from ``out/rows`` where it is there, else made in a fresh process and written there.
+
+    Args:
+        progress: called with (jobs done, jobs in all).
+    Returns:
+        rows with ``name, identity, cores, threads, seed``, what ``worker.work`` measured, and ``mean``: each score averaged over the
+        modalities that have it (PSNR in dB).
+    Raises:
+        InputError: a scene cannot be read (all are looked at before the first fit), a fit fails, or ``out`` cannot be written.
+    """
+    for job in jobs:
+        scene_of(job.task())
+    hashes = {path: scene_hash(load_scene(path)) for path in {job.scene for job in jobs}}
+    for done, job in enumerate(jobs):
+        if progress is not None:
+            progress(done, len(jobs))
+        # looked up when its turn comes: the code may have been edited since the bench began
+        wanted = identity(job, hashes[job.scene])
+        path = out / "rows" / f"{job.name}-{_digest(wanted)}.json"
+        if not path.is_file():
+            machine = {"cores": wanted["machine"]["cores"], "threads": wanted["machine"]["threads"]}
+            result = run_job(job)
+            mean = mean_over_modalities(result["scores"])
+            write_json(path, {"name": job.name, "seed": job.seed, **machine, **result, "mean": mean, "identity": wanted})
+        yield read_json(path)
+    if progress is not None:
+        progress(len(jobs), len(jobs))
+
+
+def run_job(job: Job) -> dict[str, Any]:
+    """Fit and score in a fresh process (``mmsynth.bench.worker``), which ends when this one does.
+
+    Raises:
+        InputError: the fit was refused or its process died.
+    """
+    with tempfile.TemporaryDirectory(prefix="mmsynth-bench-") as folder, open(Path(folder) / "stderr", "w+b") as said:
+        command = [sys.executable, "-m", "mmsynth.bench.worker", json.dumps(job.task()), folder]
+        path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "PYTHONPATH": path}
+        # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
+            status = process.wait()
+        if status == 0:
+            return read_json(Path(folder) / "result.json")
+        said.seek(0)
+        lines = said.read().decode(errors="replace").strip().splitlines() or ["it said nothing"]
+        if status == 2 and lines[-1].startswith("error: "):
+            raise InputError(lines[-1].removeprefix("error: "))
+        raise InputError(f"{job.name}: its process ended with status {status} instead of a score ({lines[-1]}).")
+
+
+def identity(job: Job, scene: str) -> dict[str, Any]:
+    """Everything that a result depends on; ``scene``: the ``scene_hash`` of the whole scene."""
+    machine = identify()
+    task = {key: value for key, value in job.task().items() if key != "scene"}
+    return {
+        "scene": scene,
+        **task,
+        "code": code_hash(),
+        "versions": machine["versions"],
+        "machine": {key: machine[key] for key in ("cpu", "cores", "threads")},
+    }
+
+
+def scene_hash(scene: Scene) -> str:
+    """Of the frames, their poses, cameras and masks, the sensors, the region, the split and the ground truth."""
+    digest = hashlib.sha256(repr((scene.region, scene.split, scene.unit, scene.black_background, list(scene.sensors.values()))).encode())
+    for frame in scene.frames:
+        digest.update(repr((frame.sensor, frame.view, frame.camera)).encode())
+        digest.update(np.ascontiguousarray(frame.camera_to_world).tobytes())
+        for path in filter(None, (frame.path, frame.mask)):
+            digest.update(_file_hash(path))
+    for path in sorted((scene.root / "gt").rglob("*.npz")):
+        digest.update(str(path.relative_to(scene.root)).encode() + _file_hash(path))
+    return digest.hexdigest()[:16]
+
+
+def code_hash() -> str:
+    """Of the package's source that a fit and its score run through: at one version number it may have been edited."""
+    digest = hashlib.sha256()
+    for part in _CODE:
+        path = _PACKAGE / part
+        for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def mean_over_modalities(scores: Mapping[str, Any]) -> dict[str, float]:
+    """Every number that ``evaluate`` gives per modality, averaged over the modalities that have it."""
+    modalities = scores["modalities"].values()
+    keys = dict.fromkeys(key for m in modalities for key, value in m.items() if isinstance(value, float))
+    return {key: float(np.mean([m[key] for m in modalities if key in m])) for key in keys}
+
+
+def _file_hash(path: Path) -> bytes:
+    try:
+        return hashlib.sha256(path.read_bytes()).digest()
+    except OSError as error:
+        raise InputError(f"{path}: could not be read ({error.strerror}).") from error
+
+
+def _digest(value: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:12]

@@ -1,0 +1,166 @@
+"""The machine that a number was measured on: what it is, and its two limits measured beside the number."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+import mmsynth
+from mmsynth.errors import InputError
+
+# instruction sets that decide the speed of the kernels
+_FLAGS = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "avx512_bf16", "avx512_vnni", "amx_tile", "neon", "sve")
+_REPEATS = 5
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def identify() -> dict[str, Any]:
+    """What the machine is and what runs on it, without measuring: ``cpu, flags, cores, threads, memory_gb, gpu, versions``."""
+    info = _cpuinfo()
+    return {
+        "cpu": info.get("model name") or platform.processor() or platform.machine(),
+        "flags": _flags(info),
+        "cores": usable_cores(),
+        "threads": torch.get_num_threads(),
+        "memory_gb": round(_memory_bytes() / 1e9, 1),
+        "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
+        "system": platform.system(),
+        "versions": {
+            "mmsynth": mmsynth.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numba": numba.__version__,
+            "numpy": np.__version__,
+        },
+    }
+
+
+def measure() -> dict[str, Any]:
+    """``identify`` and the machine's limits, measured now, in about a second.
+
+    ``bandwidth_gb_s`` and ``bandwidth_one_thread_gb_s``: memory traffic of a triad a = b + s c on arrays beyond the caches, counted as
+    three arrays (as STREAM does: the read that a store may need is not counted). ``gemm_gflops``: float32 ``torch.mm``, 2 n³ operations.
+    Each is the best of five. ``load``: the system's load average over the last minute, before; None where there is none.
+    """
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    with use_threads(1):
+        alone = _triad()
+    return identify() | {"load": load, "bandwidth_gb_s": _triad(), "bandwidth_one_thread_gb_s": alone, "gemm_gflops": _gemm()}
+
+
+@contextmanager
+def use_threads(count: int | None) -> Iterator[None]:
+    """Run torch and numba on ``count`` threads; None: leave them as they are.
+
+    Raises:
+        InputError: numba was started with fewer.
+    """
+    if count is None:
+        yield
+        return
+    before = torch.get_num_threads(), numba.get_num_threads()
+    most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    if count > most:
+        raise InputError(f"--threads {count}: numba was started with {most} (NUMBA_NUM_THREADS), expected no more.")
+    try:
+        torch.set_num_threads(count)
+        numba.set_num_threads(count)
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
+def peak_memory() -> int:
+    """Peak resident memory of this process, bytes.
+
+    Not ``ru_maxrss`` on Linux: a child inherits that from the process that started it, so that a small fit started by a large
+    process would look large.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if platform.system() == "Darwin" else peak * 1024
+
+
+def describe(machine: dict[str, Any]) -> str:
+    """What ``measure`` found, as one line."""
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    load = f"; load {machine['load']:.1f} at the start" if machine["load"] is not None else ""
+    return (
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['threads']} threads, {machine['memory_gb']:g} GB{gpu} "
+        f"({' '.join(machine['flags'])}); memory {machine['bandwidth_gb_s']:.1f} GB/s, {machine['bandwidth_one_thread_gb_s']:.1f} on one "
+        f"thread; float32 GEMM {machine['gemm_gflops']:.0f} GFLOP/s{load}; {versions}"
+    )
+
+
+def _cpuinfo() -> dict[str, str]:
+    """The first processor in /proc/cpuinfo; empty on other systems."""
+    path = Path("/proc/cpuinfo")
+    if not path.is_file():
+        return {}
+    first = path.read_text().split("\n\n")[0]
+    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in first.splitlines())}
+
+
+def _flags(info: dict[str, str]) -> list[str]:
+    found = set(info.get("flags", info.get("Features", "")).split())
+    if "asimd" in found or platform.machine() in ("arm64", "aarch64"):
+        found.add("neon")
+    # where there is no /proc, torch knows which vector code it chose
+    return [flag for flag in _FLAGS if flag in found] or [torch.backends.cpu.get_cpu_capability().lower()]
+
+
+def _memory_bytes() -> int:
+    if not hasattr(os, "sysconf"):
+        return 0
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _last_cache_bytes() -> int:
+    sizes = [path.read_text().strip() for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size")]
+    return max((int(size[:-1]) * 1024 for size in sizes if size.endswith("K")), default=32 << 20)
+
+
+def _best_seconds(work: Callable[[], Any]) -> float:
+    work()
+    best = float("inf")
+    for _ in range(_REPEATS):
+        began = time.perf_counter()
+        work()
+        best = min(best, time.perf_counter() - began)
+    return best
+
+
+def _triad() -> float:
+    """GB/s on the threads that torch now has."""
+    # three arrays of at least twice the last cache, in at most an eighth of the memory
+    count = min(max(2 * _last_cache_bytes(), 64 << 20), max(_memory_bytes() // 24, 8 << 20)) // 4
+    a, b, c = (torch.ones(count) for _ in range(3))
+    return 3 * 4 * count / _best_seconds(lambda: torch.add(b, c, alpha=0.5, out=a)) / 1e9
+
+
+def _gemm(size: int = 1024) -> float:
+    """GFLOP/s of a float32 product of two ``size`` × ``size`` matrices."""
+    a, b = torch.rand(size, size), torch.rand(size, size)
+    out = torch.empty(size, size)
+    return 2 * size**3 / _best_seconds(lambda: torch.mm(a, b, out=out)) / 1e9

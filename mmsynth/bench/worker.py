@@ -1,0 +1,78 @@
+"""One fit, measured: the process that ``jobs.run_job`` starts, ``python -m mmsynth.bench.worker TASK FOLDER``.
+
+TASK is the JSON of a ``Job.task``; the result is written to FOLDER/result.json. The process ends when its standard input does, so that
+the fit of a bench that was killed does not go on beside the next one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mmsynth.bench.jobs import scene_of
+from mmsynth.bench.machine import peak_memory
+from mmsynth.errors import InputError
+from mmsynth.field.kernels import announce_compilation
+from mmsynth.files import write_json
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.trainer import fit
+from mmsynth.operations.evaluate import evaluate
+from mmsynth.scene.load import load_scene
+
+
+def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Fit and score.
+
+    Returns:
+        ``seconds``: of the fit, from files to a field on disk, without loading the compiled kernels. ``steps``. ``rays_per_s,
+        samples_per_s``: of the fit; ``render_rays_per_s``: of the test views. ``cpu_share``: processor time by wall time and threads,
+        lower than usual on a machine that others use, too. ``peak_memory_bytes``: of the process when the fit was done. ``scores``: of
+        ``evaluate``.
+    Raises:
+        InputError: as ``fit`` and ``evaluate``.
+    """
+    announce_compilation()
+    began, cpu = time.perf_counter(), time.process_time()
+    scene = scene_of(task)
+    field = fit(scene, folder / "run", Recipe(**task["recipe"]), task["steps"], task["budget"], task["seed"])
+    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+    peak = peak_memory()
+    # the whole scene, so that sensors that were not fitted still lend their poses to be scored at
+    scores = evaluate(field, load_scene(task["scene"]), scene.split.test)
+    return {
+        "seconds": seconds,
+        "cpu_share": cpu / (seconds * torch.get_num_threads()),
+        "peak_memory_bytes": peak,
+        **{key: field.manifest[key] for key in ("steps", "rays_per_s", "samples_per_s")},
+        "render_rays_per_s": scores["rays_per_s"],
+        "scores": scores,
+    }
+
+
+def main() -> None:
+    """Read the arguments, work, write; an ``InputError`` becomes one sentence and exit code 2."""
+
+    def end_with_the_parent() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=end_with_the_parent, daemon=True).start()
+    task, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
+    try:
+        write_json(folder / "result.json", work(task, folder))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()

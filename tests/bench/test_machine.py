@@ -1,0 +1,55 @@
+"""The machine's name and limits."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from mmsynth.bench import machine
+from mmsynth.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_machine_has_a_name_and_positive_limits() -> None:
+    found = machine.measure()
+    json.dumps(found, allow_nan=False)
+    assert found["cores"] >= 1 and found["threads"] >= 1 and found["flags"] and found["memory_gb"] > 0
+    assert set(found["versions"]) == {"mmsynth", "python", "torch", "numba", "numpy"}
+    for key in ("bandwidth_gb_s", "bandwidth_one_thread_gb_s", "gemm_gflops"):
+        assert found[key] > 0
+    line = machine.describe(found)
+    assert found["cpu"] in line and torch.__version__ in line and "\n" not in line
+
+
+def test_threads_are_given_back() -> None:
+    before = torch.get_num_threads(), numba.get_num_threads()
+    with machine.use_threads(1):
+        assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+    with pytest.raises(InputError, match="--threads 99999"), machine.use_threads(99999):
+        pass
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs Linux's /proc")
+def test_peak_memory_is_the_process_own() -> None:
+    """A child of a large process is not large itself, and a peak stays when the memory is given back."""
+    large = np.ones(150_000_000, np.uint8)
+    mine = machine.peak_memory()
+    assert mine > large.nbytes
+    del large
+    assert machine.peak_memory() >= mine
+    code = "from mmsynth.bench.machine import peak_memory; import numpy; a = numpy.ones(50_000_000); del a; print(peak_memory())"
+    said = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True
+    )
+    assert 400_000_000 < int(said.stdout) < 400_000_000 + mine

@@ -1,0 +1,92 @@
+"""``mmsynth bench`` and ``mmsynth fit --frames`` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_cli import run
+from typer.testing import CliRunner
+
+from mmsynth.cli import app
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def call(*args: str) -> Any:
+    """In this process: importing torch anew for every refusal takes seconds."""
+    return CliRunner().invoke(app, args)
+
+
+def refused(result: Any, *words: str) -> None:
+    """Exit code 2, one sentence on stderr, nothing on stdout."""
+    assert result.exit_code == 2 and result.stdout == "", result.output
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: ") and all(word in line for word in words), line
+
+
+def test_bench_fit_goes_on_where_it_was(tmp_path: Path) -> None:
+    result = run(tmp_path, "bench", "fit", "example", "--budgets", "0.3s", "--modalities", "rgb,pol", "--frames", "pol=2", "--json")
+    assert result.returncode == 0, result.stderr
+    results = json.loads(result.stdout)
+    assert results["out"] == "bench/fit"
+    (row,) = results["rows"]
+    assert row["name"] == "0.3s" and row["seed"] == 0 and row["steps"] >= 1
+    assert set(row["scores"]["modalities"]) == {"rgb", "pol"} and {"psnr", "psnr_truth", "psnr_truth_full"} <= set(row["mean"])
+    out = tmp_path / "bench" / "fit"
+    assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "plot.svg", "rows"}
+    (file,) = (out / "rows").iterdir()
+    made = file.stat().st_mtime_ns
+    again = run(tmp_path, "bench", "fit", "example", "--budgets", "0.3s", "--modalities", "rgb,pol", "--frames", "polarization=2")
+    assert again.returncode == 0, again.stderr
+    assert "Error over time" in again.stdout and "wrote bench/fit/" in again.stdout
+    assert file.stat().st_mtime_ns == made and len(list((out / "rows").iterdir())) == 1
+    assert not (tmp_path / "runs").exists()
+
+
+def test_bench_ablation(tmp_path: Path) -> None:
+    (tmp_path / "table.toml").write_text('[[variant]]\nname = "both"\n[[variant]]\nname = "rgb"\nmodalities = ["rgb"]\n')
+    result = call("bench", "ablation", "example", "--table", "table.toml", "--steps", "3", "--out", "here", "--json")
+    assert result.exit_code == 0, result.output
+    results = json.loads(result.stdout)
+    assert results["out"] == "here" and [variant["name"] for variant in results["variants"]] == ["both", "rgb"]
+    assert set(results["variants"][1]["difference"]["modalities"]) == {"rgb"}
+    assert (tmp_path / "here" / "report.md").is_file()
+
+
+def test_bench_kernels(tmp_path: Path) -> None:
+    result = call("bench", "kernels", "--samples", "256", "--threads", "1", "--json")
+    assert result.exit_code == 0, result.output
+    assert {row["operation"] for row in json.loads(result.stdout)["rows"]} >= {"hash_encode", "march", "section_weights"}
+    assert (tmp_path / "bench" / "kernels" / "plot.svg").is_file()
+
+
+def test_bad_requests_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    refused(call("bench", "fit", "nowhere"), "nowhere")
+    refused(call("bench", "fit", "example", "--budgets", "15s,soon"), "--budgets", "soon")
+    refused(call("bench", "fit", "example", "--recipe", "nothing"), "nothing")
+    refused(call("bench", "fit", "example", "--frames", "pol"), "--frames", "pol=3")
+    refused(call("bench", "fit", "example", "--frames", "pol=1,polarization=2"), "--frames")
+    refused(call("bench", "fit", "example", "--frames", "thermal=1"), "thermal", "rgb")
+    refused(call("bench", "ablation", "example", "--table", "nothing"), "nothing", "engine")
+    refused(call("bench", "ablation", "example", "--seeds", "one"), "--seeds")
+    refused(call("bench", "ablation", "example", "--steps", "3", "--budget", "3s"), "--steps", "--budget")
+    refused(call("bench", "ablation", "example", "--only", "nothing"), "nothing", "baseline")
+    refused(call("bench", "kernels", "--threads", "99999"), "--threads")
+    refused(call("fit", "example", "--frames", "pol=0"), "pol")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "bench").write_text("a file")
+    refused(call("bench", "kernels", "--samples", "64"), "could not be written")
+
+
+def test_a_fit_of_few_frames_is_scored_on_all_test_views(tmp_path: Path) -> None:
+    result = call("fit", "example", "--steps", "3", "--modalities", "rgb,pol", "--frames", "pol=2", "--json")
+    assert result.exit_code == 0, result.output
+    scores = json.loads(call("evaluate", "--json").stdout)
+    assert scores["views"] == json.loads((tmp_path / "runs/latest/manifest.json").read_text())["scene"]["test_views"]
+    assert set(scores["modalities"]) == {"rgb", "pol"}
