@@ -43,7 +43,11 @@ def diagnose() -> dict[str, Any]:
     if torch.get_num_threads() > cores:
         advice.append(f"torch uses {torch.get_num_threads()} threads on {cores} cores: set OMP_NUM_THREADS={cores}.")
     if gpu:
-        advice.append("With --device cuda the field runs on torch operations; the kernels compiled for speed are the CPU's.")
+        from mmsynth.field.kernels import cuda  # triton takes its time to import
+
+        can, why = cuda.available()
+        if not can:
+            advice.append(f"GPU kernels unavailable ({why}): with --device cuda the field runs on torch operations, which are slower.")
     return {
         "python": platform.python_version(),
         "versions": versions,

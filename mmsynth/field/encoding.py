@@ -6,10 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
+from mmsynth.field.kernels.cpu_blocks import FEATURES
 
 
 class HashGrid(nn.Module):
-    """Multiresolution hash grid over the cube [-extent, extent]³ (Müller et al. 2022), 2 features per level.
+    """Multiresolution hash grid over the cube [-extent, extent]³ (Müller et al. 2022), 4 features per level.
 
     Args:
         levels: number of levels. rows_log2: log2 of the most rows a level may have; coarse levels take what they need.
@@ -26,13 +27,13 @@ class HashGrid(nn.Module):
         rows = [min((r + 1) ** 3, 2**rows_log2) for r in resolutions]
         self.register_buffer("resolutions", torch.tensor(resolutions), persistent=False)
         self.register_buffer("offsets", torch.tensor([sum(rows[:i]) for i in range(levels + 1)]), persistent=False)
-        self.table = nn.Parameter(torch.empty(sum(rows), 2).uniform_(-1e-4, 1e-4))
+        self.table = nn.Parameter(torch.empty(sum(rows), FEATURES).uniform_(-1e-4, 1e-4))
         self.extent = extent
 
     @property
     def width(self) -> int:
         """Numbers per position."""
-        return 2 * len(self.resolutions)
+        return FEATURES * len(self.resolutions)
 
     def cell(self, active: int) -> float:
         """Cell size of the finest active level."""

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
-from mmsynth.field.background import Background
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
@@ -27,8 +26,6 @@ from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import analyser_axes
-
-_BACKGROUND_FEATURES = 16
 
 
 @dataclass(frozen=True)
@@ -65,9 +62,7 @@ class Design:
     radiance_rows_log2: int = 16
     radiance_finest: int = 256
     background: bool = False
-    background_levels: int = 8
-    background_rows_log2: int = 15
-    background_finest: int = 256
+    horizon: float = 1.9
     surface_hidden: int = 32
     radiance_hidden: int = 64
     coarsest: int = 16
@@ -85,6 +80,7 @@ class Field(nn.Module):
         sensors: the modalities it knows. cameras: representative intrinsics of each.
         rig: sensor → (4, 4) sensor_to_reference, scene unit; the reference is the first sensor.
         sampling: how finely it is rendered. manifest: everything known about the fit.
+        view_dependence: degree of the spherical harmonics of each modality's radiance.
     """
 
     def __init__(
@@ -101,19 +97,17 @@ class Field(nn.Module):
         d = self.design = design
         self.sensors, self.levels, self.region, self.unit = sensors, levels, region, unit
         self.cameras, self.rig = cameras or {}, rig or {}
+        self.view_dependence = dict.fromkeys(sensors, 0)
         self.manifest: dict[str, Any] = {}
+        extent = 2.0 if d.background else 1.0
+        spheres = (d.initial_radius, d.horizon if d.background else 1e9)
         self.surface = Surface(
-            HashGrid(d.surface_levels, d.surface_rows_log2, d.coarsest, d.surface_finest), d.surface_hidden, d.initial_radius
+            HashGrid(d.surface_levels, d.surface_rows_log2, d.coarsest, d.surface_finest, extent), d.surface_hidden, spheres
         )
-        self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest)
+        self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest, extent)
         self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, levels)
-        self.background: Background | None = None
-        if d.background:
-            grid = HashGrid(d.background_levels, d.background_rows_log2, d.coarsest, d.background_finest, extent=2.0)
-            shader = Shader(_BACKGROUND_FEATURES, d.radiance_hidden // 2, sensors, levels)
-            self.background = Background(grid, d.surface_hidden, _BACKGROUND_FEATURES, shader)
-        self.occupancy = Occupancy(d.occupancy)
-        self.sampling = Sampling(20.0, 0.05, d.surface_levels, d.radiance_levels, d.background_levels)
+        self.occupancy = Occupancy(d.occupancy, extent)
+        self.sampling = Sampling(20.0, 0.05, d.surface_levels, d.radiance_levels)
 
     @property
     def device(self) -> torch.device:
@@ -124,36 +118,16 @@ class Field(nn.Module):
         unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
 
+    def _contracted(self, points: Tensor) -> Tensor:
+        """Normalised points to the frame of the grids."""
+        return kernels.contract(points) if self.surface.grid.extent > 1.0 else points
+
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance in the scene's unit, positive outside: (N, 3) → (N,) float32."""
+        """Signed distance in the scene's unit, positive outside: (N, 3) → (N,) float32. Of contracted space, where it is."""
         parts = self.to_normalised(points).split(65536)
-        values = [self.surface(part, self.sampling.active_surface) for part in parts]
+        values = [self.surface(self._contracted(part), self.sampling.active_surface) for part in parts]
         return torch.cat(values).cpu().numpy() * np.float32(self.region.radius) if values else np.empty(0, np.float32)
-
-    def pixel_values(
-        self, hits: rendering.Hits, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling
-    ) -> Callable[[str, Tensor | None, slice], Tensor]:
-        """Shade rays once; the result gives the values of any modality for any slice of them (axes as in ``Shader.values``)."""
-        front = self.shader.hidden(hits.features, directions, sampling.view_dependence)
-        background = self.background
-        behind = torch.nonzero(hits.opacity.detach() < 0.995)[:, 0] if background is not None else None
-        position = hidden = None
-        if background is not None and behind is not None and len(behind):
-            hidden = rendering.background_hidden(background, origins[behind], directions[behind], jitter[behind], sampling)
-            position = torch.full((len(origins),), -1, dtype=torch.int64, device=origins.device)
-            position[behind] = torch.arange(len(behind), device=origins.device)
-
-        def values(modality: str, axes: Tensor | None, rays: slice) -> Tensor:
-            out = hits.opacity[rays, None] * self.shader.values(modality, front[rays], axes)
-            if background is not None and position is not None and hidden is not None:
-                here = position[rays]
-                rows = torch.nonzero(here >= 0)[:, 0]
-                light = background.shader.values(modality, hidden[here[rows]], None if axes is None else axes[rows])
-                out = out.index_add(0, rows, (1.0 - hits.opacity[rays][rows, None]) * light)
-            return out
-
-        return values
 
     @torch.no_grad()
     def render_rays(
@@ -163,26 +137,29 @@ class Field(nn.Module):
         rays = len(origins)
         jitter = torch.full((rays,), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
-        values = self.pixel_values(hits, origins, directions, jitter, self.sampling)
+        outputs = {d: self.shader(hits.features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
+        opacity = hits.opacity[:, None]
         out = {"opacity": hits.opacity.clamp(0.0, 1.0)}
-        everything = slice(0, rays)
         for name in modalities:
             angles = self.sensors[name].polarizer_angles_deg
             if angles is None:
-                out[name] = values(name, None, everything)
+                out[name] = opacity * self.shader.values(name, outputs[self.view_dependence[name]])
                 continue
             degrees = torch.tensor((*angles, 0.0, 45.0, 90.0), device=origins.device)
             axes = analyser_axes(directions, camera_x, torch.deg2rad(degrees).expand(rays, -1))
-            behind_analysers = values(name, axes, everything)
+            behind_analysers = opacity * self.shader.values(name, outputs[self.view_dependence[name]], axes)
             out[name] = behind_analysers[:, :-3]
             i0, i45, i90 = behind_analysers[:, -3:].unbind(1)
             out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
         if geometry:
-            depth = rendering.median_depth(hits, rays)
+            depth = hits.depth
             hit = torch.nonzero(torch.isfinite(depth))[:, 0]
             normal = torch.full_like(directions, float("nan"))
             epsilon = self.surface.grid.cell(self.sampling.active_surface)
-            slope = self.surface.gradient(origins[hit] + directions[hit] * depth[hit, None], epsilon, self.sampling.active_surface)
+            points = origins[hit] + directions[hit] * depth[hit, None]
+            slope = self.surface.gradient(self._contracted(points), epsilon, self.sampling.active_surface)
+            if self.surface.grid.extent > 1.0:
+                slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
             out["depth"], out["normal"] = depth, normal
         return out
@@ -260,6 +237,7 @@ class Field(nn.Module):
             "design": asdict(self.design),
             "sampling": asdict(self.sampling),
             "levels": self.levels,
+            "view_dependence": self.view_dependence,
             "region": asdict(self.region),
             "unit": self.unit,
             "sensors": [_sensor_to_json(s) for s in self.sensors.values()],
@@ -288,6 +266,7 @@ class Field(nn.Module):
             rig = {n: np.array(m) for n, m in stored["rig"].items()}
             field = Field(Design(**stored["design"]), sensors, stored["levels"], region, stored["unit"], cameras, rig)
             field.sampling = Sampling(**stored["sampling"])
+            field.view_dependence = dict(stored["view_dependence"])
             field.load_state_dict(load_file(run / "field.safetensors"))
         except (KeyError, TypeError) as error:
             raise InputError(f"{run / 'manifest.json'}: not the manifest of a fit of this version ({error}).") from error

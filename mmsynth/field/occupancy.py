@@ -19,8 +19,9 @@ class Occupancy(nn.Module):
 
     states: Tensor
 
-    def __init__(self, resolution: int) -> None:
+    def __init__(self, resolution: int, extent: float = 1.0) -> None:
         super().__init__()
+        self.extent = extent
         self.register_buffer("states", torch.full((resolution,) * 3, SHELL, dtype=torch.uint8))
 
     @torch.no_grad()
@@ -39,10 +40,11 @@ class Occupancy(nn.Module):
         again = torch.rand(flat.shape[0], generator=generator) < share
         cells = torch.nonzero((flat == SHELL) | again.to(flat.device))[:, 0]
         index = torch.stack([cells // (grid * grid), cells // grid % grid, cells % grid], -1)
-        margin = slack * 3**0.5 / grid + 7.0 / sharpness
+        margin = slack * self.extent * 3**0.5 / grid + 5.0 / sharpness
         for part in torch.arange(len(cells), device=cells.device).split(65536):
-            value = sdf((index[part].float() + 0.5) * (2.0 / grid) - 1.0)
-            state = torch.where(value > margin, OUTSIDE, torch.where(value < -margin, SOLID, SHELL))
+            value = sdf(((index[part].float() + 0.5) * (2.0 / grid) - 1.0) * self.extent)
+            free = (value - margin) * (grid / (self.extent * slack))
+            state = torch.where(value > margin, OUTSIDE + free.clamp(0, 253 - OUTSIDE), torch.where(value < -margin, SOLID, SHELL))
             flat[cells[part]] = state.to(torch.uint8)
         if bool((flat == SHELL).any()):
             return True

@@ -1,6 +1,7 @@
-"""How samples become pixels: rays through the region of interest, sections, features, and what is behind.
+"""How samples become pixels: rays through the surface, sections between samples, and the appearance where they cross it.
 
-All lengths are in the normalised frame, where the region of interest is the unit ball.
+All lengths are in the normalised frame, where the region of interest is the unit ball. Where a scene has a background, all of
+space is contracted into a ball of radius 2, and the one surface reaches as far as rays do.
 """
 
 from __future__ import annotations
@@ -11,42 +12,46 @@ import torch
 from torch import Tensor
 
 from mmsynth.field import kernels
-from mmsynth.field.background import Background
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.surface import Surface
 
-_SIGNIFICANT = 1e-3  # sections below this weight are not given a colour: at most 4 % of a ray of 40 sections, usually none
+NEAR = 0.02  # radii from a camera at which rays begin when all of space is seen, or half-way to the region of interest
+HORIZON = 1e3  # where rays end that nothing stops, in radii
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How finely a ray is seen: sharpness s of the surface, step between samples, active grid levels.
+    """How finely a ray is seen.
 
-    ``view_dependence`` scales what the shader sees of the direction: 0 = radiance is the same in all directions.
+    Attributes:
+        sharpness: s of the surface; its soft part is about 3.5 / s thick. step: between samples at the surface, in contracted
+            space. active_surface, active_radiance: levels of the grids.
+        stride: share of the free distance that a ray goes at once, away from the surface.
+        grazing: a ray that approaches the surface at less than this slope steps as if it had it.
+        significant: sections of a smaller weight are given no appearance of their own.
+        opaque: optical depth at which a ray ends.
     """
 
     sharpness: float
     step: float
     active_surface: int
     active_radiance: int
-    active_background: int
-    background_samples: int = 16
-    view_dependence: float = 1.0
+    stride: float = 0.7
+    grazing: float = 0.5
+    significant: float = 1e-2
+    opaque: float = 3.0
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays meet, R rays: features (R, F) (their mean over the hit), opacity (R,), and all samples taken."""
+    """What R rays meet: features (R, F), the mean over the hit; opacity (R,) in [0, 1]; depth (R,), the ray distance at which
+    half of the light is met, NaN = no hit; samples: how many were taken, a number."""
 
     features: Tensor
     opacity: Tensor
-    positions: Tensor
-    t: Tensor
-    ray: Tensor
-    offsets: Tensor
-    weights: Tensor
-    crossing: Tensor
+    depth: Tensor
+    samples: Tensor
 
 
 def ball_interval(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,47 +67,70 @@ def ball_interval(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 def trace(
     surface: Surface, appearance: HashGrid, occupancy: Occupancy, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling
 ) -> Hits:
-    """March, evaluate, weigh and composite the features of the region of interest.
+    """March, evaluate, weigh and composite the features of rays.
 
-    Appearance is looked up where each section crosses the surface, once per section that matters, and shaded once per ray.
+    Appearance is looked up where each section crosses the surface, once per section that matters; it is shaded once per ray.
 
     Args:
-        origins, directions: (R, 3), unit directions. jitter: (R,) in [0, 1).
+        origins, directions: (R, 3), unit directions; gradients reach them with the samples' distances held fixed.
+        jitter: (R,) in [0, 1), shifts the samples.
     """
-    rays = origins.shape[0]
-    near, far = ball_interval(origins, directions)
-    t, ray, offsets = kernels.march(origins, directions, near, far, jitter, occupancy.states, sampling.step)
-    positions = origins[ray] + directions[ray] * t[:, None]
-    sdf = surface(positions, sampling.active_surface)
+    if surface.grid.extent > 1.0:
+        # a surface right before a camera explains its picture and no other: there is none
+        near = (0.5 * (torch.linalg.vector_norm(origins.detach(), dim=-1) - 1.0)).clamp(min=NEAR)
+        far = torch.full_like(jitter, HORIZON)
+    else:
+        near, far = ball_interval(origins.detach(), directions.detach())
+    if kernels.on_cpu(origins):
+        return Hits(*kernels.cpu.trace(surface, appearance, occupancy.states, origins, directions, near, far, jitter, sampling))
+    return trace_by_parts(surface, appearance, occupancy, origins, directions, near, far, jitter, sampling)
+
+
+def trace_by_parts(
+    surface: Surface, appearance: HashGrid, occupancy: Occupancy, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor,
+    jitter: Tensor, sampling: Sampling,
+) -> Hits:  # fmt: skip
+    """``trace`` from single operations, with autograd, on any device and in any precision; near, far: (R,)."""
+    rays = len(origins)
+    contracted = surface.grid.extent > 1.0
+    with torch.no_grad():
+        t, ray, offsets = kernels.march(
+            lambda x: surface(x, sampling.active_surface), origins, directions, near, far, jitter, occupancy.states,
+            surface.grid.extent, sampling,
+        )  # fmt: skip
+
+    def place(ray: Tensor, t: Tensor) -> Tensor:
+        points = origins[ray] + directions[ray] * t[:, None]
+        return kernels.contract(points) if contracted else points
+
+    sdf = surface(place(ray, t), sampling.active_surface)
     weights, crossing = kernels.section_weights(sdf, sampling.sharpness, offsets)
-    chosen = torch.nonzero(weights.detach() > _SIGNIFICANT)[:, 0]
-    at = ray[chosen]
-    t_hit = torch.lerp(t[chosen], t[(chosen + 1).clamp(max=max(len(t) - 1, 0))], crossing[chosen])
-    encoded = appearance(origins[at] + directions[at] * t_hit[:, None], sampling.active_radiance)
-    total = kernels.accumulate(weights[chosen], torch.cat([encoded, torch.ones_like(encoded[:, :1])], 1), at, rays)
-    opacity = total[:, -1]
-    features = total[:, :-1] / opacity.clamp(min=_SIGNIFICANT)[:, None]
-    return Hits(features, opacity, positions, t, ray, offsets, weights, crossing)
+    with torch.no_grad():
+        # what is left of a ray that was ended goes to its last section
+        before = kernels.exclusive_sum(weights, offsets, ray)
+        ended = before + weights > -torch.expm1(torch.tensor(-sampling.opaque))
+        rest = torch.where(ended, 1.0 - before - weights, torch.zeros_like(weights))
+        first = ended & ~(before > -torch.expm1(torch.tensor(-sampling.opaque)))
+        rest = torch.where(first, rest, torch.zeros_like(rest))
+    weights = weights + rest
+    opacity = torch.zeros_like(jitter).index_add(0, ray, weights)
+    chosen = torch.nonzero(weights.detach() > sampling.significant)[:, 0]
+    following = (chosen + 1).clamp(max=max(len(t) - 1, 0))
+    at, w = ray[chosen], weights[chosen]
+    encoded = appearance(place(at, torch.lerp(t[chosen], t[following], crossing[chosen])), sampling.active_radiance)
+    shown = torch.zeros_like(jitter).index_add(0, at, w)
+    features = torch.zeros(rays, appearance.width, dtype=w.dtype, device=w.device).index_add(0, at, w[:, None] * encoded)
+    depth = median_depth(t, weights.detach(), before, crossing, ray, rays)
+    return Hits(features / shown.clamp(min=1e-12)[:, None], opacity, depth, torch.tensor(len(t)))
 
 
-def background_hidden(background: Background, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling) -> Tensor:
-    """Hidden layer of the background's shader, (R, H), for rays that see past the region of interest."""
-    near, far = ball_interval(origins, directions)
-    distance = torch.linalg.vector_norm(origins, dim=-1)
-    # rays that miss the ball see everything from half-way to it on
-    start = torch.where(far > near, far, 0.5 * distance).clamp(min=1e-2)
-    features = background(origins, directions, start, jitter, sampling.background_samples, sampling.active_background)
-    return background.shader.hidden(features, directions, sampling.view_dependence)
+def median_depth(t: Tensor, weights: Tensor, before: Tensor, crossing: Tensor, ray: Tensor, rays: int) -> Tensor:
+    """Ray distance at which half of the light is met, at the surface crossing of that section: (R,), NaN = no hit.
 
-
-def median_depth(hits: Hits, rays: int) -> Tensor:
-    """Ray distance at which half of the light is met, at the surface crossing of that section: (R,), NaN = no hit."""
-    depth = torch.full((rays,), float("nan"), device=hits.t.device)
-    if not len(hits.t):
-        return depth
-    before = hits.weights.cumsum(0) - hits.weights
-    passed = before - before[hits.offsets[:-1].clamp(max=len(hits.t) - 1)][hits.ray] + hits.weights
-    reached = torch.nonzero((passed >= 0.5) & (passed - hits.weights < 0.5))[:, 0]
-    following = (reached + 1).clamp(max=len(hits.t) - 1)
-    depth[hits.ray[reached]] = torch.lerp(hits.t[reached], hits.t[following], hits.crossing[reached])
-    return depth
+    Args:
+        t, weights, before, crossing, ray: (N,) of packed samples; ``before`` is the weight in front of each section.
+    """
+    depth = torch.full((rays,), float("nan"), dtype=t.dtype, device=t.device)
+    reached = torch.nonzero((before + weights >= 0.5) & (before < 0.5))[:, 0]
+    following = (reached + 1).clamp(max=max(len(t) - 1, 0))
+    return depth.index_put((ray[reached],), torch.lerp(t[reached], t[following], crossing[reached]))

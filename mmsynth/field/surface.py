@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 
 # corners of a regular tetrahedron: the four taps of a first derivative, its trace exact for linear functions
@@ -12,21 +14,30 @@ _TAPS = ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, 1.0, 1.0
 
 
 class Surface(nn.Module):
-    """sdf(x) = |x| - r₀ + MLP(hash grid(x), x), with a zero last layer: exactly a sphere at step 0, no warm-up fit."""
+    """sdf(x) = |x| - r0 + network(hash grid(x), x), with a zero last layer: exactly a sphere at step 0, no warm-up fit."""
 
-    def __init__(self, grid: HashGrid, hidden: int, initial_radius: float) -> None:
+    def __init__(self, grid: HashGrid, hidden: int, spheres: tuple[float, float]) -> None:
         super().__init__()
+        if hidden % 4:
+            raise ValueError(f"{hidden} hidden units, expected a multiple of 4: the CPU kernels take four at a time")
         self.grid = grid
-        self.hidden = nn.Linear(grid.width + 3, hidden)
-        self.last = nn.Linear(hidden, 1)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
-        self.initial_radius = initial_radius
+        layer = nn.Linear(grid.width + 3, hidden)
+        w = layer.weight.detach()
+        self.hidden = nn.Parameter(torch.cat([w[:, -3:], layer.bias.detach()[:, None], w[:, :-3]], 1))
+        self.last = nn.Parameter(torch.zeros(hidden + 1))
+        self.spheres = np.array(spheres, np.float32)
 
     def forward(self, positions: Tensor, active: int) -> Tensor:
-        """Signed distance, positive outside: (N, 3) → (N,)."""
-        hidden = torch.relu(self.hidden(torch.cat([self.grid(positions, active), positions], -1)))
-        return self.last(hidden)[:, 0] + (torch.linalg.vector_norm(positions, dim=-1) - self.initial_radius)
+        """Signed distance, positive outside: (N, 3) -> (N,)."""
+        if kernels.on_cpu(positions):
+            return kernels.cpu.surface_value(self, positions, active)
+        return self.reference(positions, active)
+
+    def reference(self, positions: Tensor, active: int) -> Tensor:
+        ones = torch.ones_like(positions[:, :1])
+        hidden = torch.relu(torch.cat([positions, ones, self.grid(positions, active)], -1) @ self.hidden.T)
+        norm = torch.linalg.vector_norm(positions, dim=-1)
+        return hidden @ self.last[:-1] + self.last[-1] + torch.minimum(norm - float(self.spheres[0]), float(self.spheres[1]) - norm)
 
     def gradient(self, positions: Tensor, epsilon: float, active: int) -> Tensor:
         """∇sdf by four-tap differences of size ``epsilon`` (Neuralangelo, Li et al. 2023): (N, 3) → (N, 3)."""

@@ -18,20 +18,33 @@ from mmsynth.sensors.polarization import analyser_axes
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays of one modality, R of them, in the normalised frame.
+    """R rays of all modalities in the normalised frame, and the M numbers measured along them.
+
+    Numbers of one modality lie together, radiance before polarization.
 
     Attributes:
-        origins, directions: (R, 3). target: (R, K) raw values. channel: (R,) the measured channel of a mosaic (K = 1), else None.
-        axes: (R, K, 3) analyser axes of a polarization sensor, else None. alpha: (R,) opacity to match, else None.
+        origins, directions: (R, 3).
+        target: (M,) raw values. ray: (M,) int64. output: (M,) int64, the shader output that predicts the number; the first of
+            six for a polarization.
+        axes: (P, 3) analyser axes of the last P numbers.
+        level, saturation, weight: (M,) the modality's typical value, where it clips, and the share in a mean over modalities.
+        frame: (M,) int64, counted through the modalities in the order of ``parts``.
+        parts: per modality its rays and its numbers.
+        alpha: (R,) opacity to match, NaN = none.
     """
 
-    modality: str
     origins: Tensor
     directions: Tensor
     target: Tensor
-    channel: Tensor | None
-    axes: Tensor | None
-    alpha: Tensor | None
+    ray: Tensor
+    output: Tensor
+    axes: Tensor
+    level: Tensor
+    saturation: Tensor
+    weight: Tensor
+    frame: Tensor
+    parts: dict[str, tuple[slice, slice]]
+    alpha: Tensor
 
 
 class Measurements:
@@ -47,8 +60,13 @@ class Measurements:
         for frame in frames:
             pixels, alpha = load_frame(sensor, frame)
             values.append(_compact(pixels.reshape(-1, 1 if pixels.ndim == 2 else pixels.shape[2])))
-            alphas.append(None if alpha is None else _compact(alpha.reshape(-1)))
-        self.values, self.alphas = values, alphas
+            alphas.append(alpha)
+        self.starts = np.cumsum([0] + [len(v) for v in values])[:-1]
+        self.values = _joined(values)
+        self.has_alpha = any(a is not None for a in alphas)
+        # a frame without alpha beside frames with one is opaque
+        opaque = [np.ones(len(v), np.float32) if a is None else a.reshape(-1) for v, a in zip(values, alphas, strict=True)]
+        self.alphas = _joined([_compact(a) for a in opaque]) if self.has_alpha else None
         self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
         poses = np.stack([f.camera_to_world for f in frames])
         self.rotations = poses[:, :3, :3].astype(np.float32)
@@ -63,13 +81,12 @@ class Measurements:
         self.counts = np.array([_count(self.usable[c], self.directions[c]) for c in self.camera_index])
         self.ends = np.cumsum(self.counts)
         self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
-        self.has_alpha = any(a is not None for a in alphas)
         drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
         self.level = float(self.read(drawn, pixel)[0].mean())
 
     def pick(self, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``count`` pixels, uniform over all frames with replacement, sorted by frame: frame and pixel indices, (count,) each."""
-        drawn = np.sort(random.integers(0, self.ends[-1], count))
+        """``count`` pixels, uniform over all frames with replacement: frame and pixel indices, (count,) each."""
+        drawn = random.integers(0, self.ends[-1], count)
         frame = np.searchsorted(self.ends, drawn, side="right")
         pixel = drawn - (self.ends[frame] - self.counts[frame])
         for c, usable in enumerate(self.usable):
@@ -81,50 +98,89 @@ class Measurements:
     def rays(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions, (N, 3) float32 each, normalised frame."""
         in_camera = np.empty((len(frame), 3), np.float32)
-        for c, directions in enumerate(self.directions):
+        if len(self.directions) == 1:
+            in_camera = self.directions[0][pixel]
+        for c, directions in enumerate(self.directions if len(self.directions) > 1 else []):
             here = self.camera_index[frame] == c
             in_camera[here] = directions[pixel[here]]
         return self.origins[frame], np.einsum("nij,nj->ni", self.rotations[frame], in_camera)
 
     def read(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Values (N, K) and alpha (N,) or None, float32. With alpha, values are premultiplied: what the object adds to black."""
-        starts = np.flatnonzero(np.r_[True, frame[1:] != frame[:-1]])
-        runs = list(zip(starts, np.r_[starts[1:], len(frame)], strict=True))
-        target = np.concatenate([_decode(self.values[frame[a]][pixel[a:b]]) for a, b in runs])
-        if not self.has_alpha:
+        index = self.starts[frame] + pixel
+        target = _decode(self.values[index])
+        if self.alphas is None:
             return target, None
-        alpha = [np.ones(b - a, np.float32) if (m := self.alphas[frame[a]]) is None else _decode(m[pixel[a:b]]) for a, b in runs]
-        opacity = np.concatenate(alpha)
-        return target * opacity[:, None], opacity
+        alpha = _decode(self.alphas[index])
+        return target * alpha[:, None], alpha
 
-    def batch(self, count: int, random: np.random.Generator, device: torch.device) -> Batch:
-        """A random batch of ``count`` rays."""
-        frame, pixel = self.pick(count, random)
-        origins, directions = self.rays(frame, pixel)
-        target, alpha = self.read(frame, pixel)
-        channel = None
-        if self.sensor.mosaic is not None:
-            measured = np.empty(count, np.int64)
-            for c, channels in enumerate(self.channels):
-                here = self.camera_index[frame] == c
-                measured[here] = channels[pixel[here]]  # type: ignore[index]
-            channel = torch.from_numpy(measured)
-        axes = None
-        world = torch.from_numpy(directions)
-        if self.sensor.polarizer_angles_deg is not None:
-            angles = torch.deg2rad(torch.tensor(self.sensor.polarizer_angles_deg, dtype=torch.float32))
-            of_ray = angles[channel][:, None] if channel is not None else angles.expand(count, -1)
-            camera_x = torch.from_numpy(np.ascontiguousarray(self.rotations[frame][:, :, 0]))
-            axes = analyser_axes(world, camera_x, of_ray).to(device)
-        return Batch(
-            self.sensor.name,
-            torch.from_numpy(origins).to(device),
-            world.to(device),
-            torch.from_numpy(target).to(device),
-            None if channel is None else channel.to(device),
-            axes,
-            None if alpha is None else torch.from_numpy(alpha).to(device),
-        )
+    def measured(self, frame: np.ndarray, pixel: np.ndarray) -> np.ndarray | None:
+        """Channel that each pixel of a mosaic measures, (N,) int64; None when pixels measure all channels."""
+        if self.sensor.mosaic is None:
+            return None
+        if len(self.channels) == 1:
+            return self.channels[0][pixel]  # type: ignore[index]
+        out = np.empty(len(pixel), np.int64)
+        for c, channels in enumerate(self.channels):
+            here = self.camera_index[frame] == c
+            out[here] = channels[pixel[here]]  # type: ignore[index]
+        return out
+
+
+def draw(
+    measurements: dict[str, Measurements],
+    columns: dict[str, slice],
+    rays: dict[str, int],
+    random: np.random.Generator,
+    device: torch.device,
+) -> Batch:
+    """A random batch.
+
+    Args:
+        columns: the shader outputs of each modality. rays: how many of each modality.
+    """
+    order = sorted(measurements, key=lambda n: measurements[n].sensor.is_polarization)
+    parts: dict[str, tuple[slice, slice]] = {}
+    lists: dict[str, list[np.ndarray]] = {k: [] for k in ("origins", "directions", "target", "ray", "output", "axes", "frame", "alpha")}
+    numbers = []
+    r_end = m_end = frames = 0
+    for name in order:
+        m, count = measurements[name], rays[name]
+        frame, pixel = m.pick(count, random)
+        origins, directions = m.rays(frame, pixel)
+        target, alpha = m.read(frame, pixel)
+        channel = m.measured(frame, pixel)
+        values = target.shape[1]
+        if m.sensor.polarizer_angles_deg is not None:
+            angles = np.deg2rad(np.array(m.sensor.polarizer_angles_deg, np.float32))
+            angle = angles[channel][:, None] if channel is not None else np.tile(angles, (count, 1))
+            camera_x = torch.from_numpy(np.ascontiguousarray(m.rotations[frame][:, :, 0]))
+            axes = analyser_axes(torch.from_numpy(directions), camera_x, torch.from_numpy(angle))
+            lists["axes"].append(axes.numpy().reshape(-1, 3))
+            output = np.full(count * values, columns[name].start)
+        elif channel is not None:
+            output = columns[name].start + channel
+        else:
+            output = np.tile(np.arange(columns[name].start, columns[name].stop), count)
+        lists["origins"].append(origins)
+        lists["directions"].append(directions)
+        lists["target"].append(target.reshape(-1))
+        lists["ray"].append(np.repeat(np.arange(r_end, r_end + count), values))
+        lists["output"].append(output)
+        lists["frame"].append(np.repeat(frame + frames, values))
+        frames += len(m.origins)
+        lists["alpha"].append(np.full(count, np.nan, np.float32) if alpha is None else alpha)
+        parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + count * values)
+        r_end += count
+        m_end += count * values
+        numbers.append((count * values, m.level, m.sensor.saturation, 1.0 / (len(order) * count * values)))
+    lengths = [n[0] for n in numbers]
+    joined = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in lists.items() if v}
+    level, saturation, weight = (
+        torch.from_numpy(np.repeat(np.array(x, np.float32), lengths)).to(device) for x in zip(*(n[1:] for n in numbers), strict=True)
+    )
+    joined.setdefault("axes", torch.empty(0, 3, device=device))
+    return Batch(**joined, level=level, saturation=saturation, weight=weight, parts=parts)
 
 
 def load_measurements(scene: Scene) -> dict[str, Measurements]:
@@ -160,8 +216,14 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """One array of all frames; frames stored in different ways are decoded first."""
+    same = len({p.dtype for p in parts}) == 1
+    return np.concatenate(parts if same else [_decode(p) for p in parts])
+
+
 def _decode(stored: np.ndarray) -> np.ndarray:
     """Back to float32, 1.0 = full scale."""
     if stored.dtype == np.float32:
         return stored
-    return stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    return stored.astype(np.float32) / np.float32(255.0 if stored.dtype == np.uint8 else 65535.0)

@@ -23,13 +23,18 @@ class Needs:
     """The choice and why.
 
     Attributes:
-        footprint: the finest detail to expect at the region's centre, in radii. evidence: one line per choice.
+        footprint: the finest detail to expect at the region's centre, in radii.
+        scarce: modalities with so few pixels that they would spoil what others know better: they learn their colours from the
+            geometry and appearance of the others. share: of the rays that each modality gets, relative to a plentiful one.
+        evidence: one line per choice.
     """
 
     design: Design
     footprint: float
     sharpness_end: float
     black_background: bool
+    scarce: tuple[str, ...]
+    share: dict[str, float]
     evidence: dict[str, str]
 
     def to_json(self) -> dict[str, Any]:
@@ -63,16 +68,23 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         past = f"{outside:.1%} of {rays} sampled pixels see past the region of interest"
         evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black"
     # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
-    surface_finest = int(np.clip(recipe.surface_cells / footprint, 32, 1024))
-    radiance_finest = int(np.clip(recipe.radiance_cells / footprint, 64, 2048))
+    extent = 2 if background else 1  # contracted space is twice as wide
+    surface_finest = int(np.clip(extent * recipe.surface_cells / footprint, 32, 1024))
+    radiance_finest = int(np.clip(extent * recipe.radiance_cells / footprint, 64, 2048))
     cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
     seen = f", {coarser:.1f} pixels apart for {rays_to_come:.1e} rays on {pixels:.1e} pixels" if coarser > 1 else ""
     evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}"
-    # measured: before a background a small sphere leaves the scene to the background; alone, a large one is painted and stays
-    radius = recipe.initial_radius or (0.5 if background else 0.15)
+    # measured: a large sphere fills hollows between objects, and stays there painted
+    radius = recipe.initial_radius or (0.4 if background else 0.15)
+    farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in measurements.values())
+    horizon = recipe.horizon or 2.0 - 1.0 / (4.0 * max(farthest, 1.0))
     evidence["initial_sphere"] = (
         f"radius {radius:g}: {'asked for by the recipe' if recipe.initial_radius else 'background ' + ('on' if background else 'off')}"
     )
+    share = _shares(measurements, recipe.scarce_below)
+    scarce = tuple(n for n, s in share.items() if s < 1.0)
+    frames = ", ".join(f"{n} {len(measurements[n].origins)} frames" for n in scarce)
+    evidence["scarce"] = f"on: {frames}: learned from the geometry of the others" if scarce else "off: all modalities have enough pixels"
     pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
     evidence["tensor_head"] = f"on: {', '.join(pol)}" if pol else "off: no polarization sensor"
     design = Design(
@@ -83,14 +95,21 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         radiance_rows_log2=_rows_log2(radiance_finest, recipe.radiance_rows_log2),
         radiance_finest=radiance_finest,
         background=background,
-        background_finest=int(np.clip(2.0 / footprint, 64, 512)),
+        horizon=horizon,
         surface_hidden=recipe.surface_hidden,
         radiance_hidden=recipe.radiance_hidden,
         occupancy=recipe.occupancy_resolution,
         initial_radius=radius,
     )
     black = not background and outside >= 0.005
-    return Needs(design, footprint, max(recipe.sharpness_end / footprint, 2 * recipe.sharpness_start), black, evidence)
+    return Needs(design, footprint, max(recipe.sharpness_end / footprint, 2 * recipe.sharpness_start), black, scarce, share, evidence)
+
+
+def _shares(measurements: dict[str, Measurements], below: float) -> dict[str, float]:
+    """1 for a modality with at least ``below`` of the pixels of the one that has most, else in proportion to its pixels."""
+    pixels = {n: int(m.ends[-1]) for n, m in measurements.items()}
+    enough = below * max(pixels.values())
+    return {n: min(1.0, count / enough) if enough else 1.0 for n, count in pixels.items()}
 
 
 def _rows_log2(finest: int, most: int) -> int:
@@ -118,6 +137,6 @@ def _look_outside(measurements: dict[str, Measurements], random: np.random.Gener
         values = m.read(frame, pixel)[0].mean(1)
         missing = closest > 1.0
         misses += int(missing.sum())
-        bright += int((values[missing] > 0.15 * np.quantile(values, 0.95)).sum())
+        bright += int((values[missing] > 0.25 * np.quantile(values, 0.95)).sum())
         rays += len(frame)
     return misses / rays, bright / max(misses, 1), rays

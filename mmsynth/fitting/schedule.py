@@ -16,20 +16,20 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     opened = min(1.0, progress / recipe.levels_until)
 
     def active(levels: int) -> int:
-        first = min(4, levels)
+        first = min(2, levels)
         return first + round(opened * (levels - first))
 
     design = needs.design
     return Sampling(
         sharpness=sharpness,
         # three steps across the soft surface (its width is about 3.5 / s); never coarser than a twentieth of the radius
-        step=min(0.05, 2.0 / sharpness),
+        step=min(0.1, recipe.step_width / sharpness),
+        stride=recipe.stride,
+        grazing=recipe.grazing,
+        opaque=recipe.opaque,
+        significant=recipe.significant,
         active_surface=active(design.surface_levels),
         active_radiance=active(design.radiance_levels),
-        active_background=active(design.background_levels),
-        background_samples=recipe.background_samples,
-        # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
-        view_dependence=1.0 if progress >= recipe.view_dependence_from else 0.0,
     )
 
 

@@ -23,15 +23,18 @@ from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
 from mmsynth.files import write_text
-from mmsynth.fitting import losses
+from mmsynth.fitting import losses, probe
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
-from mmsynth.fitting.measurements import Batch, Measurements, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, load_measurements
 from mmsynth.fitting.needs import Needs, assess
+from mmsynth.fitting.optimiser import Adam
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
 from mmsynth.scene.scene import Scene
 
 CHECKPOINT_SECONDS = 60.0
+PROBE_RAYS = 1024  # per modality
+_GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
 
 
@@ -57,6 +60,7 @@ class _State:
     samples_total: int = 0
     bad_steps: int = 0
     reopened: int = 0
+    decided: dict[str, Any] | None = None
 
 
 class Trainer:
@@ -79,15 +83,15 @@ class Trainer:
         levels = {n: m.level for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
         self.field = Field(self.needs.design, sensors, levels, scene.region, scene.unit, cameras, rig_of(scene)).to(self.device)
-        grids = [p for n, p in self.field.named_parameters() if n.endswith(".table")]
-        networks = [p for n, p in self.field.named_parameters() if not n.endswith(".table")]
-        self.optimiser = torch.optim.Adam(
-            [{"params": grids, "base": recipe.learning_rate_grid}, {"params": networks, "base": recipe.learning_rate_network}],
-            betas=(0.9, 0.99),
-            eps=1e-15,
-            fused=True,
-        )
+        frames = sum(len(m.origins) for m in self.measurements.values())
+        self.log_gain = torch.nn.Parameter(torch.zeros(frames, device=self.device))
+        parameters = {**dict(self.field.named_parameters()), _GAINS: self.log_gain}
+        tables = {n for n in parameters if n.endswith(".table")}
+        rates = {n: recipe.learning_rate_grid if n in tables else recipe.learning_rate_network for n in parameters}
+        rates[_GAINS] = recipe.learning_rate_exposure
+        self.optimiser = Adam(parameters, rates)
         self.state = _State(rays=recipe.rays_at_start)
+        self.has_alpha = any(m.has_alpha for m in self.measurements.values())
         self.mean_loss = math.nan
         self.mean_error: dict[str, float] = {}
 
@@ -100,7 +104,7 @@ class Trainer:
 
     def _rays_to_come(self) -> float:
         """Rays that the fit will see, about: a constant per step or second, so that the design does not depend on the clock."""
-        return self.steps * self.recipe.samples_per_step / 10 if self.steps is not None else (self.budget or 0.0) * 30_000
+        return self.steps * self.recipe.samples_per_step / 10 if self.steps is not None else (self.budget or 0.0) * 70_000
 
     def run_step(self) -> None:
         """One optimiser step."""
@@ -113,70 +117,127 @@ class Trainer:
             sdf = lambda x: field.surface(x, sampling.active_surface)
             if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
                 state.reopened += 1
-        per_modality = max(1, state.rays // len(self.measurements))
-        batches = [m.batch(per_modality, random, self.device) for m in self.measurements.values()]
-        loss, errors, samples = self._loss(batches, sampling, generator)
+        if state.decided is None:
+            # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
+            seen = 0 if self.progress < recipe.view_dependence_from else probe.DEGREES
+            field.view_dependence.update(dict.fromkeys(self.measurements, seen))
+            if self.progress >= recipe.decide_at:
+                self._decide(sampling)
+        total = sum(self.needs.share.values())
+        rays = {n: max(1, int(state.rays * share / total)) for n, share in self.needs.share.items()}
+        batch = draw(self.measurements, field.shader.columns, rays, random, self.device)
+        loss, errors, samples = self._loss(batch, sampling, generator)
         if not bool(torch.isfinite(loss)):
             self._skip("the loss is not finite")
             return
-        self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        factor = learning_rate_factor(self.progress, recipe)
-        for group in self.optimiser.param_groups:
-            group["lr"] = group["base"] * factor
-        self.optimiser.step()
+        networks = [p.grad for n, p in field.named_parameters() if not n.endswith(".table") and p.grad is not None]
+        if not bool(torch.isfinite(torch.cat([g.flatten() for g in networks]).sum())):  # what is NaN in a sample is NaN in a sum
+            self.optimiser.clear()
+            self._skip("a gradient is not finite")
+            return
+        self.optimiser.step(learning_rate_factor(self.progress, recipe))
         keep = 0.98 if state.step else 0.0
-        self.mean_loss = float(loss.detach()) if not state.step else keep * self.mean_loss + (1 - keep) * float(loss.detach())
+        first = math.isnan(self.mean_loss)  # also after steps that were skipped
+        self.mean_loss = float(loss.detach()) if first else keep * self.mean_loss + (1 - keep) * float(loss.detach())
         for name, error in errors.items():
             self.mean_error[name] = keep * self.mean_error.get(name, error) + (1 - keep) * error
-        state.rays_total += per_modality * len(batches)
+        state.rays_total += len(batch.origins)
         state.samples_total += samples
         # a fixed number of samples a step; the number of rays follows, by at most a factor of two either way
         ratio = min(2.0, max(0.5, recipe.samples_per_step / max(samples, 1)))
-        state.rays = int(min(65536, max(len(batches), 0.5 * state.rays * (1 + ratio))))
+        state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
         state.step += 1
 
-    def _loss(
-        self, batches: list[Batch], sampling: rendering.Sampling, generator: torch.Generator
-    ) -> tuple[torch.Tensor, dict[str, float], int]:
+    def _loss(self, batch: Batch, sampling: rendering.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
         recipe, field = self.recipe, self.field
-        origins = torch.cat([b.origins for b in batches])
-        directions = torch.cat([b.directions for b in batches])
+        origins, directions = batch.origins, batch.directions
         jitter = torch.rand(len(origins), generator=generator).to(self.device)
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
-        values = field.pixel_values(hits, origins, directions, jitter, sampling)
-        loss = torch.zeros((), device=self.device)
-        errors = {}
-        begin = 0
-        for batch in batches:
-            rays = slice(begin, begin + len(batch.origins))
-            begin = rays.stop
-            # a polarization mosaic has one analyser per ray and so one value; other mosaics pick their channel
-            predicted = values(batch.modality, batch.axes, rays)
-            if batch.channel is not None and batch.axes is None:
-                predicted = predicted.gather(1, batch.channel[:, None])
-            difference = losses.residual(predicted, batch.target, field.sensors[batch.modality].saturation)
-            loss = loss + losses.photometric(difference, field.levels[batch.modality]) / len(batches)
-            errors[batch.modality] = float(difference.detach().square().mean())
-            opacity = hits.opacity[rays]
-            if batch.alpha is not None:
-                loss = loss + recipe.opacity * (opacity - batch.alpha).square().mean() / len(batches)
-            elif self.needs.black_background:
-                black = (batch.target.amax(1) < 0.02 * field.levels[batch.modality]).float()
-                loss = loss + recipe.emptiness * (opacity * black).mean() / len(batches)
+        hidden, opacity = field.shader.hidden(hits.features, directions, self._degrees(batch)), hits.opacity
+        for name in self.needs.scarce:
+            # a few frames would bend geometry, appearance and trunk to themselves: they teach their own head alone
+            rays = batch.parts[name][0]
+            hidden, opacity = _detached(hidden, rays), _detached(opacity, rays)
+        outputs = field.shader.heads(hidden)
+        predicted = losses.predict(outputs, opacity, batch)
+        if self.state.decided and self.state.decided["exposure"]:
+            predicted = predicted * torch.exp(self.log_gain - self.log_gain.mean())[batch.frame]
+        difference = losses.residual(predicted, batch)
+        loss = losses.photometric(difference, batch)
+        squared = difference.detach().square()
+        errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
+        if self.has_alpha:
+            known = torch.isfinite(batch.alpha)
+            loss = loss + recipe.opacity * (hits.opacity - batch.alpha)[known].square().sum() / len(origins)
+        elif self.needs.black_background:
+            black = torch.zeros_like(hits.opacity).scatter_reduce(0, batch.ray, batch.target / batch.level, "amax") < 0.02
+            loss = loss + recipe.emptiness * (hits.opacity * black).mean()
         if recipe.eikonal > 0:
-            loss = loss + recipe.eikonal * losses.eikonal(self._gradients(hits, sampling, generator))
-        return loss, errors, len(hits.t)
+            loss = loss + recipe.eikonal * losses.eikonal(self._gradients(hits, origins, directions, sampling, generator))
+        return loss, errors, int(hits.samples)
 
-    def _gradients(self, hits: rendering.Hits, sampling: rendering.Sampling, generator: torch.Generator) -> torch.Tensor:
-        """∇sdf at a random subset of the samples and at some points of the whole region."""
+    def _degrees(self, batch: Batch) -> torch.Tensor:
+        degrees = torch.empty(len(batch.origins), dtype=torch.int64)
+        for name, (rays, _) in batch.parts.items():
+            degrees[rays] = self.field.view_dependence[name]
+        return degrees.to(self.device)
+
+    @torch.no_grad()
+    def _decide(self, sampling: rendering.Sampling) -> None:
+        """Put the residuals of this moment to the tests of ``probe``, and switch on what they ask for."""
+        recipe, field = self.recipe, self.field
+        random = np.random.default_rng((self.seed, 2))
+        batch = draw(self.measurements, field.shader.columns, dict.fromkeys(self.measurements, PROBE_RAYS), random, self.device)
+        jitter = torch.full((len(batch.origins),), 0.5, device=self.device)
+        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+        predicted = losses.predict(field.shader(hits.features, batch.directions, self._degrees(batch)), hits.opacity, batch)
+        evidence = self.needs.evidence
+        degrees, spreads, begin = {}, {}, 0
+        usable = batch.target < batch.saturation
+        errors = probe.errors_by_degree(field.shader, hits.features, hits.opacity, batch) if recipe.view_dependence == "auto" else {}
+        for name, (_, numbers) in batch.parts.items():
+            if recipe.view_dependence == "auto":
+                degree = probe.degree_needed(errors[name], recipe.view_dependence_worth)
+                grown = ", ".join(f"{e / errors[name][-1] - 1:+.1%}" for e in errors[name][:-1])
+                evidence[f"view_dependence.{name}"] = f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}"
+            else:
+                degree = recipe.view_dependence
+                evidence[f"view_dependence.{name}"] = f"degree {degree}: asked for by the recipe"
+            degrees[name] = degree
+            level, frames = field.levels[name], len(self.measurements[name].origins)
+            rows = [x[numbers][usable[numbers]].cpu().numpy() for x in (predicted / level, batch.target / level, batch.frame)]
+            spread, noise = probe.exposure_spread(probe.Residuals(rows[0], rows[1], rows[2] - begin), frames)
+            begin += frames
+            spreads[name] = spread if spread > 2 * noise / math.sqrt(max(frames, 1)) else 0.0
+        exposure = max(spreads.values()) > recipe.exposure_worth
+        why = ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
+        asked = recipe.exposure != "auto"
+        exposure = recipe.exposure == "on" if asked else exposure
+        evidence["exposure"] = (
+            f"{'on' if exposure else 'off'}: {'asked for by the recipe; ' if asked else ''}exposure differs between frames by {why}"
+        )
+        field.view_dependence.update(degrees)
+        self.state.decided = {"view_dependence": degrees, "exposure": exposure, "evidence": dict(evidence)}
+
+    def _gradients(
+        self,
+        hits: rendering.Hits,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        sampling: rendering.Sampling,
+        generator: torch.Generator,
+    ) -> torch.Tensor:
+        """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""
         count = self.recipe.eikonal_points
-        anywhere = torch.rand(count // 4, 3, generator=generator).to(self.device) * 2 - 1
-        points = [anywhere]
-        if len(hits.t):
-            chosen = torch.randint(len(hits.t), (count - len(anywhere),), generator=generator).to(self.device)
-            points.append(hits.positions[chosen])
-        # float32 differences: one cell of the grid is far above the rounding of the sdf
+        extent = self.field.surface.grid.extent
+        points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * extent).to(self.device)]
+        hit = torch.nonzero(torch.isfinite(hits.depth))[:, 0]
+        if len(hit):
+            chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
+            noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
+            at = origins[chosen] + directions[chosen] * hits.depth[chosen, None]
+            points.append((kernels.contract(at) if extent > 1 else at) + noise)
         epsilon = self.field.surface.grid.cell(sampling.active_surface)
         return self.field.surface.gradient(torch.cat(points), epsilon, sampling.active_surface)
 
@@ -185,6 +246,15 @@ class Trainer:
         self.state.bad_steps += 1
         if self.state.bad_steps >= _BAD_STEPS:
             raise InputError(f"fit: {reason} in {self.state.bad_steps} steps (last: step {self.state.step}); the checkpoint is kept.")
+
+    def gains(self) -> dict[str, list[float]]:
+        """Exposure of each training frame relative to the mean, per modality; empty when no gains were needed."""
+        if not self.state.decided or not self.state.decided["exposure"]:
+            return {}
+        gains = torch.exp(self.log_gain - self.log_gain.mean()).detach().cpu()
+        order = sorted(self.measurements, key=lambda n: self.measurements[n].sensor.is_polarization)
+        parts = gains.split([len(self.measurements[n].origins) for n in order])
+        return {n: part.tolist() for n, part in zip(order, parts, strict=True)}
 
     def report(self) -> Progress:
         """News for a progress bar."""
@@ -199,6 +269,7 @@ class Trainer:
             "version": 1,
             "task": self.task,
             "field": self.field.state_dict(),
+            "log_gain": self.log_gain.detach(),
             "optimiser": self.optimiser.state_dict(),
             "state": vars(self.state).copy(),
             "mean_loss": self.mean_loss,
@@ -219,7 +290,11 @@ class Trainer:
                 )
         self.field.load_state_dict(saved["field"])
         self.optimiser.load_state_dict(saved["optimiser"])
+        self.log_gain.data.copy_(saved["log_gain"])
         self.state = _State(**saved["state"])
+        if self.state.decided is not None:
+            self.field.view_dependence.update(self.state.decided["view_dependence"])
+            self.needs.evidence.update(self.state.decided["evidence"])
         self.mean_loss, self.mean_error = saved["mean_loss"], dict(saved["mean_error"])
 
     @functools.cached_property
@@ -228,7 +303,7 @@ class Trainer:
         digest = hashlib.sha256()
         for name, m in self.measurements.items():
             digest.update(name.encode())
-            for part in (m.origins, m.rotations, *m.values):
+            for part in (m.origins, m.rotations, m.values):
                 digest.update(np.ascontiguousarray(part).tobytes())
         return {
             "scene": digest.hexdigest()[:16],
@@ -237,6 +312,11 @@ class Trainer:
             "steps": self.steps or 0,
             "budget": self.budget or 0.0,
         }
+
+
+def _detached(values: torch.Tensor, rows: slice) -> torch.Tensor:
+    """The same values; the given rows pass no gradient on."""
+    return torch.cat([values[: rows.start], values[rows].detach(), values[rows.stop :]])
 
 
 def pick_device(name: str) -> str:
@@ -349,6 +429,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
         },
         "recipe": trainer.recipe.model_dump(),
         "needs": trainer.needs.to_json(),
+        "exposure": trainer.gains(),
         "seed": trainer.seed,
         "steps": trainer.state.step,
         "seconds": {"fit": news.elapsed},

@@ -1,29 +1,52 @@
 """The trainer on the packaged example scene, a few steps at a time."""
 
+from __future__ import annotations
+
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import ring
 
 from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
+from mmsynth.field.kernels import SHELL
+from mmsynth.field.surface import Surface
+from mmsynth.fitting import losses
 from mmsynth.fitting import trainer as trainer_module
-from mmsynth.fitting.losses import photometric, residual
-from mmsynth.fitting.measurements import load_measurements
+from mmsynth.fitting.checkpoint import read_checkpoint
+from mmsynth.fitting.measurements import draw, load_measurements
 from mmsynth.fitting.recipe import Recipe, load_recipe
-from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
+from mmsynth.fitting.trainer import Trainer, fit, pick_device, rig_of
 from mmsynth.operations.evaluate import evaluate
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
+from mmsynth.sensors.camera import Camera, ray_map
 
-SMALL = Recipe(
-    samples_per_step=2048, rays_at_start=128, radiance_rows_log2=12, surface_rows_log2=12, occupancy_resolution=24, eikonal_points=128
-)  # type: ignore[call-arg]
+# every number that a result here depends on: the defaults are tuned from time to time
+SMALL = Recipe.model_validate({
+    "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "surface_rows_log2": 12, "radiance_levels": 4,
+    "radiance_rows_log2": 12, "surface_cells": 1.0, "radiance_cells": 2.0, "surface_hidden": 32, "radiance_hidden": 64,
+    "occupancy_resolution": 24, "occupancy_every": 16, "initial_radius": 0.3, "horizon": 1.8, "sharpness_start": 20.0,
+    "sharpness_end": 4.0, "sharpness_until": 0.6, "step_width": 2.0, "stride": 0.7, "grazing": 0.5, "significant": 0.01, "opaque": 3.0,
+    "levels_until": 0.4, "view_dependence_from": 0.3, "decide_at": 0.6, "view_dependence": 2, "exposure": "off",
+    "learning_rate_grid": 2e-2, "learning_rate_network": 8e-3, "learning_rate_end": 0.1, "eikonal": 0.05, "eikonal_points": 128,
+    "emptiness": 0.02, "opacity": 0.5,
+})  # fmt: skip
+
+
+def _recipe(**changes: Any) -> Recipe:
+    return Recipe.model_validate({**SMALL.model_dump(), **changes})
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +54,38 @@ def scene() -> Scene:
     return load_scene(data_folder("example_scene"))
 
 
+def _trainer(scene: Scene, steps: int = 10, **changes: Any) -> Trainer:
+    return Trainer(scene, _recipe(**changes), steps, None, 0, "cpu")
+
+
 def _tensors(field: Field) -> dict[str, torch.Tensor]:
     return {k: v.clone() for k, v in field.state_dict().items()}
+
+
+Picture = Callable[[Camera, np.ndarray], np.ndarray]
+
+
+def disc(camera: Camera, pose: np.ndarray) -> np.ndarray:
+    """White, of half the picture's width, on black."""
+    v, u = np.mgrid[:18, :24]
+    return np.repeat(0.8 * (np.hypot(u - 11.5, v - 8.5) < 5)[..., None], 3, -1)
+
+
+def transparent_disc(camera: Camera, pose: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.full((18, 24, 3), 0.8), disc(camera, pose)[..., :1] / 0.8], -1)
+
+
+def _ball_scene(folder: Path, picture: Picture, views: int = 6) -> Scene:
+    """Views of 18 by 24 pixels from around; the last tests."""
+    sensor, camera, frames = Sensor("rgb", ("R", "G", "B"), (None,) * 3), Camera(24, 18, 25.0, 25.0, 11.5, 8.5), []
+    for view, pose in enumerate(ring(views)):
+        np.save(folder / f"{view}.npy", picture(camera, pose).astype(np.float32))
+        frames.append(Frame("rgb", view, folder / f"{view}.npy", camera, pose))
+    split = Split(tuple(range(views - 1)), (views - 1,), "test")
+    return Scene(folder, "test", {"rgb": sensor}, tuple(frames), Region((0.0, 0.0, 0.0), 1.0), split)
+
+
+# --- a fit and its run
 
 
 def test_a_fit_learns_and_its_run_gives_the_same_field_back(scene: Scene, tmp_path: Path) -> None:
@@ -46,36 +99,105 @@ def test_a_fit_learns_and_its_run_gives_the_same_field_back(scene: Scene, tmp_pa
     a, b = (f.render(frame.camera, frame.camera_to_world, ["rgb", "pol"]) for f in (field, again))
     np.testing.assert_array_equal(a.channels["rgb"], b.channels["rgb"])
     np.testing.assert_array_equal(a.stokes["pol"], b.stokes["pol"])
+    np.testing.assert_array_equal(a.depth_ray, b.depth_ray)
     assert a.channels["rgb"].shape == (frame.camera.height, frame.camera.width, 3)
     hit = np.isfinite(a.depth_z)
     assert hit.any() and (a.depth_ray[hit] >= a.depth_z[hit]).all()
     np.testing.assert_allclose(np.linalg.norm(a.normal[hit], axis=-1), 1.0, atol=1e-5)
+    assert field.manifest["skipped_steps"] == 0 and field.manifest["steps"] == 300
 
 
-def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _tensors(fit(scene, tmp_path / "whole", SMALL, steps=24, seed=3))
+def test_a_fit_with_a_background_learns_too(tmp_path: Path) -> None:
+    """A sky whose colour is that of the direction, and a grey ball before it."""
+
+    def picture(camera: Camera, pose: np.ndarray) -> np.ndarray:
+        d = ray_map(camera)[0] @ pose[:3, :3].T
+        b = d @ pose[:3, 3]
+        hit = b**2 - pose[:3, 3] @ pose[:3, 3] + 0.5**2 > 0
+        return np.where(hit[..., None], 0.7, 0.5 + 0.4 * d)
+
+    scene = _ball_scene(tmp_path, picture, 24)
+    field = fit(scene, tmp_path / "run", _recipe(background="on"), steps=600)
+    assert field.design.background and field.surface.grid.extent == 2.0
+    (frame,) = scene.frames_of("rgb", scene.split.test)
+    seen = field.render(frame.camera, frame.camera_to_world)
+    expected = picture(frame.camera, frame.camera_to_world)
+    assert np.square(seen.channels["rgb"] - expected).mean() < 0.25 * expected.var()
+    assert (seen.opacity > 0.5).mean() > 0.95  # every ray ends somewhere
+    ball = expected[..., 0] == expected[..., 1]
+    assert 2.4 < np.median(seen.depth_ray[ball]) < 3.2
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("decide_at", [0.2, 0.8])  # before and after the kill
+def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decide_at: float) -> None:
+    recipe = _recipe(decide_at=decide_at, view_dependence="auto", exposure="on", occupancy_every=5)
+    whole = fit(scene, tmp_path / "whole", recipe, steps=24, seed=3)
     monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
-
-    class Killed(Exception):
-        pass
 
     def kill(news: trainer_module.Progress) -> None:
         if news.step == 13:
             raise Killed
 
     with pytest.raises(Killed):
-        fit(scene, tmp_path / "cut", SMALL, steps=24, seed=3, on_step=kill)
+        fit(scene, tmp_path / "cut", recipe, steps=24, seed=3, on_step=kill)
     assert not (tmp_path / "cut" / "manifest.json").exists()
-    steps = []
-    resumed = fit(scene, tmp_path / "cut", SMALL, seed=3, resume=True, on_step=lambda n: steps.append(n.step))
-    assert steps[0] == 13 and steps[-1] == 24  # the checkpoint of step 12 was the last before the kill
+    news = []
+    resumed = fit(scene, tmp_path / "cut", recipe, seed=3, resume=True, on_step=news.append)
+    assert [n.step for n in news] == list(range(13, 25))  # the checkpoint of step 12 was the last before the kill
+    expected = _tensors(whole)
     for name, value in _tensors(resumed).items():
-        assert torch.equal(value, whole[name]), name
+        assert torch.equal(value, expected[name]), name
+    assert resumed.view_dependence == whole.view_dependence
+    same = ("exposure", "recipe", "seed", "steps", "train_psnr", "skipped_steps", "grid_reopened")
+    assert {k: resumed.manifest[k] for k in same} == {k: whole.manifest[k] for k in same}
+    assert resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+
+
+def test_the_log_of_a_resumed_fit_has_every_step_once(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit is killed after a log line and before its checkpoint: that line is written again, not twice."""
+    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    ticks = iter(float(i) * 2 for i in range(10_000))
+    monkeypatch.setattr(trainer_module, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))  # a log line every step
+
+    def kill(news: trainer_module.Progress) -> None:
+        if news.step == 5:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(scene, tmp_path, SMALL, steps=8, on_step=kill)
+    log = tmp_path / "train.jsonl"
+    log.write_text(log.read_text() + json.dumps({"step": 7, "elapsed": 0.0, "loss": 1.0, "psnr": {}}) + "\n")
+    fit(scene, tmp_path, SMALL, steps=8, resume=True)
+    lines = [json.loads(x) for x in log.read_text().splitlines()]
+    assert [x["step"] for x in lines] == list(range(1, 9))
+    assert all(math.isfinite(x["loss"]) and set(x["psnr"]) == set(scene.sensors) for x in lines)
+
+
+def test_an_interrupted_fit_says_how_to_go_on(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    step = Trainer.run_step
+
+    def interrupted(self: Trainer) -> None:
+        if self.state.step == 2:
+            raise KeyboardInterrupt
+        step(self)
+
+    monkeypatch.setattr(Trainer, "run_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, tmp_path, SMALL, steps=5)
+    assert "--resume" in capsys.readouterr().err
+    saved = read_checkpoint(tmp_path)
+    assert saved is not None and saved["state"]["step"] == 0  # none of the steps since was saved, none of them half done
 
 
 def test_the_seed_decides_the_field(scene: Scene, tmp_path: Path) -> None:
     a, b, c = (_tensors(fit(scene, tmp_path / str(i), SMALL, steps=6, seed=s)) for i, s in enumerate((0, 0, 1)))
-    assert torch.equal(a["appearance.table"], b["appearance.table"])
+    assert all(torch.equal(a[name], b[name]) for name in a)
     assert not torch.equal(a["appearance.table"], c["appearance.table"])
 
 
@@ -85,62 +207,313 @@ def test_a_checkpoint_of_another_fit_is_refused(scene: Scene, tmp_path: Path) ->
         fit(scene, tmp_path, SMALL, steps=3, seed=1, resume=True)
     with pytest.raises(InputError, match="steps"):
         fit(scene, tmp_path, SMALL, steps=5, resume=True)
+    with pytest.raises(InputError, match="recipe"):
+        fit(scene, tmp_path, _recipe(eikonal=0.2), steps=3, resume=True)
+    with pytest.raises(InputError, match="scene"):
+        fit(load_scene(data_folder("example_scene"), ["rgb"]), tmp_path, SMALL, steps=3, resume=True)
     (tmp_path / "checkpoint" / "state.pt").write_bytes(b"broken")
     with pytest.raises(InputError, match="not a readable checkpoint"):
         fit(scene, tmp_path, SMALL, steps=3, resume=True)
 
 
-def test_modalities_get_equal_rays_and_mosaics_one_channel(scene: Scene) -> None:
-    trainer = Trainer(scene, SMALL, 5, None, 0, "cpu")
-    random = np.random.default_rng(0)
-    for name, m in trainer.measurements.items():
-        batch = m.batch(300, random, torch.device("cpu"))
-        assert batch.target.shape == (300, 1)
-        mosaic = scene.sensors[name].mosaic
-        assert (batch.channel is None) == (mosaic is None)
-        if batch.channel is not None:
-            assert set(batch.channel.tolist()) == set(np.unique(mosaic))
-        assert (batch.axes is not None) == scene.sensors[name].is_polarization
-        torch.testing.assert_close(batch.directions.norm(dim=1), torch.ones(300))
+# --- length
 
 
-def test_a_batch_reads_the_pixel_its_ray_goes_through(scene: Scene) -> None:
-    from mmsynth.sensors.camera import project
+def test_a_fit_takes_the_steps_it_was_given(scene: Scene, tmp_path: Path) -> None:
+    news: list[trainer_module.Progress] = []
+    started = []
+    fit(scene, tmp_path, SMALL, steps=7, on_start=started.append, on_step=news.append)
+    assert [n.step for n in news] == list(range(1, 8))
+    np.testing.assert_allclose([n.done for n in news], np.arange(1, 8) / 7)
+    assert len(started) == 1 and started[0].design.surface_levels == 4
+    assert all(n.rays_per_s > 0 and n.samples_per_s > n.rays_per_s / 10 and set(n.psnr) == set(scene.sensors) for n in news)
 
-    m = Trainer(scene, SMALL, 5, None, 0, "cpu").measurements["ms"]
-    frames = scene.frames_of("ms", scene.split.train)
-    random = np.random.default_rng(1)
-    frame, pixel = m.pick(50, random)
-    origins, directions = m.rays(frame, pixel)
-    values, _ = m.read(frame, pixel)
-    for i in range(50):
-        f = frames[frame[i]]
-        in_camera = f.camera_to_world[:3, :3].T @ directions[i]
-        u, v = project(in_camera[None].astype(np.float64), f.camera)[0]
-        row, column = divmod(int(pixel[i]), f.camera.width)
-        assert abs(u - column) < 1e-3 and abs(v - row) < 1e-3
-        assert values[i, 0] == load_frame(m.sensor, f)[0][row, column]
-        world = origins[i] * scene.region.radius + np.array(scene.region.centre)
-        np.testing.assert_allclose(world, f.camera_to_world[:3, 3], atol=1e-5)
+
+def test_a_budget_ends_a_fit_by_the_clock(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that goes on by a second each time it is asked."""
+    ticks = iter(range(10_000))
+    monkeypatch.setattr(trainer_module, "time", SimpleNamespace(perf_counter=lambda: float(next(ticks))))
+    news: list[trainer_module.Progress] = []
+
+    def kill(n: trainer_module.Progress) -> None:
+        news.append(n)
+        if n.step == 4:
+            raise Killed
+
+    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    with pytest.raises(Killed):
+        fit(scene, tmp_path, SMALL, budget=12.0, on_step=kill)
+    assert all(n.done == pytest.approx(n.elapsed / 12.0) for n in news)
+    before = news[2].elapsed
+    news.clear()
+    field = fit(scene, tmp_path, SMALL, resume=True, on_step=news.append)  # the budget is the checkpoint's
+    assert news[0].step == 4 and before < news[0].elapsed < news[-1].elapsed
+    assert news[-1].done == 1.0 and all(n.done < 1.0 for n in news[:-1]) and 12.0 <= news[-1].elapsed < 16.0
+    assert field.manifest["seconds"]["fit"] == news[-1].elapsed
+
+
+def test_length_is_steps_or_time(scene: Scene) -> None:
+    for steps, budget in ((5, 5.0), (None, None)):
+        with pytest.raises(InputError, match="either a number of steps or a time budget"):
+            Trainer(scene, SMALL, steps, budget, 0, "cpu")
+
+
+def test_the_number_of_rays_follows_the_samples(scene: Scene) -> None:
+    trainer = _trainer(scene, 40, occupancy_every=4)
+    counts, samples = [trainer.state.rays], []
+    for _ in range(40):
+        before = trainer.state.samples_total
+        trainer.run_step()
+        counts.append(trainer.state.rays)
+        samples.append(trainer.state.samples_total - before)
+    growth = np.array(counts[1:]) / np.array(counts[:-1])
+    assert growth.max() <= 1.5 and growth.min() >= 0.74
+    assert counts[0] == 128 and 0.7 < np.median(samples[-15:]) / 2048 < 1.4
+
+
+# --- what is not a number
+
+
+def test_a_loss_that_is_not_finite_skips_the_step(scene: Scene) -> None:
+    trainer = _trainer(scene)
+    trainer.run_step()
+    with torch.no_grad():
+        trainer.field.shader.heads.bias[0] = torch.nan
+    before, count = _tensors(trainer.field), trainer.optimiser.count
+    trainer.run_step()
+    assert (trainer.state.step, trainer.state.bad_steps, trainer.optimiser.count) == (2, 1, count)
+    after = _tensors(trainer.field)
+    assert all(torch.equal(before[n].nan_to_num(), after[n].nan_to_num()) for n in before)
+    with torch.no_grad():
+        trainer.field.shader.heads.bias[0] = 0.0
+    trainer.run_step()
+    assert (trainer.state.step, trainer.state.bad_steps, trainer.optimiser.count) == (3, 1, count + 1)
+    assert all(torch.isfinite(p).all() for p in trainer.field.parameters()) and math.isfinite(trainer.mean_loss)
+
+
+@pytest.mark.parametrize("what", ["surface.last", "shader.heads.weight", "surface.grid.table"])
+def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str) -> None:
+    trainer = _trainer(scene)
+    trainer.run_step()
+    parameter = dict(trainer.field.named_parameters())[what]
+    if what == "surface.grid.table":  # its gradient is added in place: what is NaN there came by the network
+        trainer.field.surface.hidden.register_hook(lambda g: g * torch.nan)
+        hook = trainer.field.surface.last.register_hook(lambda g: g * torch.nan)
+    else:
+        hook = parameter.register_hook(lambda g: g * torch.nan)
+    before, moments = _tensors(trainer.field), {n: [x.clone() for x in m] for n, m in trainer.optimiser.moments.items()}
+    trainer.run_step()
+    assert (trainer.state.bad_steps, trainer.optimiser.count) == (1, 1)
+    assert all(torch.equal(value, before[name]) for name, value in _tensors(trainer.field).items())
+    assert all(torch.equal(x, y) for n, m in trainer.optimiser.moments.items() for x, y in zip(m, moments[n], strict=True))
+    assert not any(p.grad.any() for p in trainer.field.parameters() if p.grad is not None)  # nothing is left for the next step
+    if what != "surface.grid.table":
+        hook.remove()
+        trainer.run_step()
+        assert (trainer.state.bad_steps, trainer.optimiser.count) == (1, 2)
+        assert all(torch.isfinite(p).all() for p in trainer.field.parameters())
+
+
+def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    photometric = losses.photometric
+
+    def sometimes(difference: torch.Tensor, batch: Any) -> torch.Tensor:
+        calls.append(1)
+        return photometric(difference, batch) * (torch.nan if len(calls) in (1, 4) else 1.0)
+
+    monkeypatch.setattr(losses, "photometric", sometimes)
+    news: list[trainer_module.Progress] = []
+    field = fit(scene, tmp_path, SMALL, steps=6, on_step=news.append)
+    assert field.manifest["skipped_steps"] == 2 and field.manifest["steps"] == 6
+    assert all(math.isfinite(n.loss) for n in news[1:]), "a first step that was skipped leaves nothing in the running mean"
+
+
+def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -> None:
+    trainer = _trainer(scene, 100)
+    with torch.no_grad():
+        trainer.field.surface.last[-1] = torch.nan
+    with pytest.raises(InputError, match="not finite in 20 steps"):
+        for _ in range(100):
+            trainer.run_step()
+    assert trainer.state.step == 20
+
+
+# --- what a loss is made of
+
+
+def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
+    trainer.recipe = _recipe(**changes)
+    sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
+    return float(trainer._loss(batch, sampling, torch.Generator().manual_seed(0))[0].detach())
+
+
+@torch.no_grad()
+def _opacity(trainer: Trainer, batch: Any) -> torch.Tensor:
+    from mmsynth.field import rendering
+
+    jitter = torch.rand(len(batch.origins), generator=torch.Generator().manual_seed(0))
+    sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
+    field = trainer.field
+    return rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling).opacity
+
+
+def _batch(trainer: Trainer, rays: int) -> Any:
+    counts = dict.fromkeys(trainer.measurements, rays)
+    return draw(trainer.measurements, trainer.field.shader.columns, counts, np.random.default_rng(0), torch.device("cpu"))
+
+
+def test_black_pixels_of_a_black_scene_ask_for_emptiness(tmp_path: Path) -> None:
+    trainer = _trainer(_ball_scene(tmp_path, disc))
+    assert trainer.needs.black_background and not trainer.needs.design.background
+    batch = _batch(trainer, 400)
+    with torch.no_grad():  # all opaque, so that there is something to lose
+        trainer.field.surface.last[-1] = -0.6
+    opacity = _opacity(trainer, batch)
+    black = batch.target.reshape(400, 3).amax(1) == 0
+    assert 50 < black.sum() < 350 and (opacity[black] > 0.5).sum() > 50
+    more = _loss(trainer, batch, emptiness=0.5, eikonal=0.0) - _loss(trainer, batch, emptiness=0.0, eikonal=0.0)
+    assert more == pytest.approx(0.5 * float((opacity * black).mean()), rel=1e-4)
+
+
+def test_alpha_asks_for_opacity(tmp_path: Path) -> None:
+    trainer = _trainer(_ball_scene(tmp_path, transparent_disc))
+    assert trainer.has_alpha and not trainer.needs.design.background
+    batch = _batch(trainer, 400)
+    assert set(batch.alpha.tolist()) == {0.0, 1.0}
+    opacity = _opacity(trainer, batch)
+    more = _loss(trainer, batch, opacity=0.7, eikonal=0.0) - _loss(trainer, batch, opacity=0.0, eikonal=0.0)
+    assert more == pytest.approx(0.7 * float((opacity - batch.alpha).square().mean()), rel=1e-4)
+    assert _loss(trainer, batch, opacity=0.0, emptiness=9.0, eikonal=0.0) == _loss(trainer, batch, opacity=0.0, eikonal=0.0)
+
+
+def test_an_object_on_black_is_found(tmp_path: Path) -> None:
+    """A sphere of radius 0.6 or so, seen by every ray through the discs and by no other."""
+    for picture in (disc, transparent_disc):
+        folder = tmp_path / picture.__name__
+        folder.mkdir()
+        scene = _ball_scene(folder, picture)
+        field = fit(scene, folder / "run", SMALL, steps=200)
+        frame = scene.frames_of("rgb", (5,))[0]
+        seen = field.render(frame.camera, frame.camera_to_world)
+        v, u = np.mgrid[:18, :24]
+        r = np.hypot(u - 11.5, v - 8.5)
+        assert (seen.opacity[r < 4] > 0.9).all() and (seen.opacity[r > 7] < 0.1).all()
+        np.testing.assert_allclose(np.median(seen.channels["rgb"][r < 4], 0), 0.8, atol=0.1)
+
+
+def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Callable[..., Path]) -> None:
+    root = write_transforms(channels=3)
+    for i, path in enumerate(sorted((root / "images").glob("*.png"))):
+        assert cv2.imwrite(str(path), np.random.default_rng(i).integers(0, 256, (18, 24, 4), np.uint8))
+    scene = load_scene(root)
+    m = load_measurements(scene)["rgb"]
+    batch = draw({"rgb": m}, {"rgb": slice(0, 3)}, {"rgb": 200}, np.random.default_rng(0), torch.device("cpu"))
+    assert torch.isfinite(batch.alpha).all() and len(batch.alpha.unique()) > 50
+    pixels, alpha = load_frame(m.sensor, scene.frames_of("rgb", scene.split.train)[0])
+    assert alpha is not None
+    values, opacity = m.read(np.zeros(alpha.size, np.int64), np.arange(alpha.size))
+    np.testing.assert_allclose(opacity, alpha.ravel(), atol=1e-6)
+    np.testing.assert_allclose(values, (pixels * alpha[..., None]).reshape(-1, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize("background", ["off", "on"])
+def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, monkeypatch: pytest.MonkeyPatch, background: str) -> None:
+    trainer = _trainer(scene, background=background)
+    asked: list[torch.Tensor] = []
+    gradient = Surface.gradient
+
+    def listen(self: Surface, positions: torch.Tensor, *rest: Any) -> torch.Tensor:
+        asked.append(positions)
+        return gradient(self, positions, *rest)
+
+    monkeypatch.setattr(Surface, "gradient", listen)
+    trainer.run_step()
+    (points,) = asked
+    assert points.shape == (128, 3)
+    extent = trainer.field.surface.grid.extent
+    assert extent == (2.0 if background == "on" else 1.0)
+    assert (points[:32].abs() <= extent).all() and points[:32].abs().max() > 0.8 * extent
+    # a new field is spheres of 0.3 and 1.8, 1 / 20 soft; the contracted frame is the one of the grids
+    apart = (points[32:].norm(dim=1)[:, None] - torch.tensor([0.3, 1.8 if background == "on" else 0.3])).abs().amin(1)
+    assert (apart < 0.6).all() and apart.median() < 0.2
+
+
+# --- what is built
 
 
 def test_only_needed_parts_are_built(scene: Scene) -> None:
-    trainer = Trainer(scene, SMALL, 5, None, 0, "cpu")
-    assert trainer.field.background is None and "not black" in trainer.needs.evidence["background"]
-    forced = Trainer(scene, SMALL.model_copy(update={"background": "on"}), 5, None, 0, "cpu")
-    assert forced.field.background is not None
+    trainer = _trainer(scene)
+    assert not trainer.field.design.background and trainer.needs.evidence["background"].startswith("off")
+    forced = _trainer(scene, background="on")
+    assert forced.field.design.background and "asked for by the recipe" in forced.needs.evidence["background"]
+    assert forced.field.surface.grid.extent == forced.field.appearance.extent == forced.field.occupancy.extent == 2.0
     rgb = load_scene(data_folder("example_scene"), ["rgb"])
-    assert Trainer(rgb, SMALL, 5, None, 0, "cpu").needs.evidence["tensor_head"].startswith("off")
+    assert _trainer(rgb).needs.evidence["tensor_head"].startswith("off")
 
 
-def test_saturated_targets_only_pull_upwards() -> None:
-    difference = residual(torch.tensor([1.5, 0.5, 1.5]), torch.tensor([1.0, 1.0, 0.9]), 0.998)
-    torch.testing.assert_close(difference, torch.tensor([0.0, -0.5, 0.6]))
+def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene) -> None:
+    long, short = (_trainer(scene, steps).needs for steps in (100_000, 20))
+    cameras = [f.camera for f in scene.frames]
+    distance = np.median([np.linalg.norm(f.camera_to_world[:3, 3] - scene.region.centre) for f in scene.frames]) / scene.region.radius
+    assert long.footprint == pytest.approx(distance / np.median([c.fx for c in cameras]), rel=0.02)
+    assert short.footprint > 2 * long.footprint
+    assert short.design.surface_finest <= long.design.surface_finest and short.sharpness_end < long.sharpness_end
 
 
-def test_dark_modalities_weigh_as_much_as_bright_ones() -> None:
-    relative = torch.linspace(-0.4, 0.4, 9)
-    assert photometric(relative * 1e-3, 1e-3) == pytest.approx(float(photometric(relative, 1.0)), rel=1e-5)
+def test_a_grid_in_which_nothing_is_left_opens_again_and_it_is_counted(scene: Scene) -> None:
+    trainer = _trainer(scene, occupancy_every=1)
+    trainer.run_step()
+    assert trainer.state.reopened == 0
+    with torch.no_grad():
+        trainer.field.surface.last[-1] = 5.0
+    trainer.run_step()
+    assert trainer.state.reopened == 1 and (trainer.field.occupancy.states == SHELL).all()
+
+
+def test_rig_is_that_of_every_view(scene: Scene) -> None:
+    rig = rig_of(scene)
+    assert list(rig) == list(scene.sensors) and np.array_equal(rig["rgb"], np.eye(4))
+    reference = {f.view: f.camera_to_world for f in scene.frames_of("rgb")}
+    for name, to_reference in rig.items():
+        for frame in scene.frames_of(name):
+            np.testing.assert_allclose(reference[frame.view] @ to_reference, frame.camera_to_world, atol=1e-6)
+    apart = Scene(
+        scene.root, scene.format, scene.sensors,
+        tuple(f for f in scene.frames if (f.sensor == "ms") == (f.view > 5)), scene.region, scene.split,
+    )  # fmt: skip
+    assert "ms" not in rig_of(apart) and "pol" in rig_of(apart)
+
+
+def test_devices() -> None:
+    assert pick_device("cpu") == "cpu" and pick_device("auto") in ("cpu", "cuda")
+    with pytest.raises(InputError, match="expected auto, cpu or cuda"):
+        pick_device("tpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="no CUDA device"):
+            pick_device("cuda")
+
+
+# --- recipe and schedule
+
+
+def test_a_fit_goes_from_coarse_to_fine(scene: Scene) -> None:
+    needs = _trainer(scene).needs
+    at = [sampling_at(p, SMALL, needs) for p in np.linspace(0, 1, 101)]
+    sharpness = np.array([s.sharpness for s in at])
+    assert sharpness[0] == 20.0 and (np.diff(sharpness) >= 0).all()
+    np.testing.assert_allclose(sharpness[60:], needs.sharpness_end)
+    np.testing.assert_allclose(np.diff(np.log(sharpness[:61])), np.log(needs.sharpness_end / 20.0) / 60, rtol=1e-6)
+    np.testing.assert_allclose([s.step for s in at], np.minimum(0.1, 2.0 / sharpness))
+    assert at[0].active_surface == at[0].active_radiance == 2 and {s.active_surface for s in at} == {2, 3, 4}
+    assert all(s.active_surface == s.active_radiance == 4 for s in at[40:])
+    assert (at[50].stride, at[50].grazing, at[50].significant, at[50].opaque) == (0.7, 0.5, 0.01, 3.0)
+
+
+def test_the_learning_rate_rises_and_falls() -> None:
+    factors = np.array([learning_rate_factor(p, SMALL) for p in np.linspace(0, 1, 101)])
+    assert factors[0] == 0.02 and (factors[1:34] == 1).all() and (np.diff(factors[34:]) < 0).all()
+    assert factors[-1] == pytest.approx(0.1)
 
 
 def test_recipes() -> None:
@@ -152,31 +525,8 @@ def test_recipes() -> None:
 
 def test_bad_recipe_files(tmp_path: Path) -> None:
     path = tmp_path / "r.toml"
-    for text, message in (("speed = 3", "speed"), ("eikonal = -1", "eikonal"), ("eikonal = ", "not valid TOML")):
+    cases = [("speed = 3", "speed"), ("eikonal = -1", "eikonal"), ("eikonal = ", "not valid TOML"), ("surface_hidden = 6", "multiple of 4")]
+    for text, message in cases:
         path.write_text(text)
         with pytest.raises(InputError, match=message):
             load_recipe(str(path))
-
-
-def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Callable[..., Path]) -> None:
-    root = write_transforms(channels=3)
-    for i, path in enumerate(sorted((root / "images").glob("*.png"))):
-        assert cv2.imwrite(str(path), np.random.default_rng(i).integers(0, 256, (18, 24, 4), np.uint8))
-    scene = load_scene(root)
-    m = load_measurements(scene)["rgb"]
-    batch = m.batch(200, np.random.default_rng(0), torch.device("cpu"))
-    assert batch.alpha is not None
-    pixels, alpha = load_frame(m.sensor, scene.frames_of("rgb", scene.split.train)[0])
-    assert alpha is not None
-    values, opacity = m.read(np.zeros(alpha.size, np.int64), np.arange(alpha.size))
-    np.testing.assert_allclose(opacity, alpha.ravel(), atol=1e-6)
-    np.testing.assert_allclose(values, (pixels * alpha[..., None]).reshape(-1, 3), atol=1e-6)
-
-
-def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene) -> None:
-    long, short = (Trainer(scene, SMALL, steps, None, 0, "cpu").needs for steps in (100_000, 20))
-    cameras = [f.camera for f in scene.frames]
-    distance = np.median([np.linalg.norm(f.camera_to_world[:3, 3] - scene.region.centre) for f in scene.frames]) / scene.region.radius
-    assert long.footprint == pytest.approx(distance / np.median([c.fx for c in cameras]), rel=0.02)
-    assert short.footprint > 2 * long.footprint
-    assert short.design.surface_finest <= long.design.surface_finest and short.sharpness_end < long.sharpness_end

@@ -1,319 +1,248 @@
-"""The operations for the CPU, compiled by numba.
+"""The operations for the CPU: what numba compiled, behind torch's autograd.
 
-Forward passes are parallel over samples or rays; the scatter of the encoding's backward pass is parallel over *levels*,
-so that no two threads touch one table: no atomics, one table in a core's cache, and the same sum in the same order every
-run. Kernels release the GIL and are cached on disk.
+Tables are the largest tensors of a field and few of their rows are met in one step, so their gradients are *added to*
+``table.grad`` in place and not returned to autograd: a dense gradient per call would cost more than the call. Everything else
+follows autograd's rules.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-_P1 = np.uint32(2654435761)
-_P2 = np.uint32(805459861)
-_CHUNK = 512
+from mmsynth.field.kernels import cpu_rays
+from mmsynth.field.kernels.cpu_blocks import FEATURES
+from mmsynth.field.kernels.cpu_rays import CHUNK, MOST, POINTS
+
+if TYPE_CHECKING:
+    from mmsynth.field.encoding import HashGrid
+    from mmsynth.field.rendering import Sampling
+    from mmsynth.field.surface import Surface
+
+_pool: list[tuple[tuple[int, ...], dict[str, np.ndarray]]] = []
 
 
-@njit(cache=True, inline="always")
-def _cell(positions, i, resolution):  # type: ignore[no-untyped-def]
-    """Cell indices of position i and where in the cell it is; positions are in [0, 1], so truncation is floor."""
-    px = positions[i, 0] * np.float32(resolution)
-    py = positions[i, 1] * np.float32(resolution)
-    pz = positions[i, 2] * np.float32(resolution)
-    x = min(np.int32(px), resolution - np.int32(1))
-    y = min(np.int32(py), resolution - np.int32(1))
-    z = min(np.int32(pz), resolution - np.int32(1))
-    return x, y, z, px - np.float32(x), py - np.float32(y), pz - np.float32(z)
+class _Store:
+    """Arrays of one forward pass, taken from a pool and given back when its autograd node dies: fresh pages are slow."""
+
+    def __init__(self, slots: int, sizes: dict[str, tuple[type, int]]) -> None:
+        key = tuple(size for _, size in sizes.values())
+        for index, (other, arrays) in enumerate(_pool):
+            if other == key and len(next(iter(arrays.values()))) >= slots:
+                self.key, self.arrays = key, _pool.pop(index)[1]
+                return
+        slots = 1 << max(slots - 1, 3).bit_length()
+        self.key, self.arrays = key, {name: np.empty((slots, size), dtype) for name, (dtype, size) in sizes.items()}
+
+    def take(self, names: str) -> list[np.ndarray]:
+        return [self.arrays[n] for n in names.split()]
+
+    def __del__(self) -> None:
+        if len(_pool) < 6:
+            _pool.append((self.key, self.arrays))
 
 
-@njit(cache=True, inline="always")
-def _corners(x, y, z, resolution, mask, dense):  # type: ignore[no-untyped-def]
-    """Table rows of the eight corners, z fastest (the order of ``_weights``)."""
-    if dense:
-        side = np.uint32(resolution + 1)
-        base = (np.uint32(x) * side + np.uint32(y)) * side + np.uint32(z)
-        right = base + side * side
-        one = np.uint32(1)
-        return base, base + one, base + side, base + side + one, right, right + one, right + side, right + side + one
-    x0, x1 = np.uint32(x), np.uint32(x + 1)
-    y0 = np.uint32(y) * _P1
-    y1 = y0 + _P1
-    z0 = np.uint32(z) * _P2
-    z1 = z0 + _P2
-    a, b, c, d = x0 ^ y0, x0 ^ y1, x1 ^ y0, x1 ^ y1
-    return (
-        (a ^ z0) & mask,
-        (a ^ z1) & mask,
-        (b ^ z0) & mask,
-        (b ^ z1) & mask,
-        (c ^ z0) & mask,
-        (c ^ z1) & mask,
-        (d ^ z0) & mask,
-        (d ^ z1) & mask,
-    )
+def _network(weight: Tensor) -> dict[str, tuple[type, int]]:
+    units, width = weight.shape
+    return {"row": (np.float32, POINTS), "weight_out": (np.float32, units * width), "last_out": (np.float32, units + 1)}
 
 
-@njit(cache=True, inline="always")
-def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
-    one = np.float32(1.0)
-    gx, gy, gz = one - fx, one - fy, one - fz
-    a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
-    return a * gz, a * fz, b * gz, b * fz, c * gz, c * fz, d * gz, d * fz
+def _ray_stores(weight: Tensor, appearance_levels: int) -> dict[str, tuple[type, int]]:
+    units, width = weight.shape
+    most = CHUNK * MOST
+    f, i, d = np.float32, np.int32, np.float64
+    samples = {"block": (f, width * most), "hidden": (f, units * most), "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most)}
+    rays = {"t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "id_of": (i, most), "counts": (i, CHUNK)}
+    sections = {"s_block": (f, (3 + FEATURES * appearance_levels) * most), "s_weight": (f, most), "s_time": (f, most)}
+    return {
+        **samples, **rays, **sections, "rounds": (i, 1), "sizes": (i, most), "s_ray": (i, most), "s_k": (i, most), "s_count": (i, 1),
+        **_network(weight),
+    }  # fmt: skip
 
 
-@njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _encode(positions, tables, resolutions, offsets, active, out):  # type: ignore[no-untyped-def]
-    count = positions.shape[0]
-    chunks = (count + _CHUNK - 1) // _CHUNK
-    for chunk in prange(chunks):
-        for level in range(active):
-            resolution = np.int32(resolutions[level])
-            rows = offsets[level + 1] - offsets[level]
-            dense = (np.int64(resolution) + 1) ** 3 <= rows
-            mask = np.uint32(rows - 1)
-            table = tables[offsets[level] : offsets[level + 1]]
-            for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-                x, y, z, fx, fy, fz = _cell(positions, i, resolution)
-                i0, i1, i2, i3, i4, i5, i6, i7 = _corners(x, y, z, resolution, mask, dense)
-                w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
-                out[i, 2 * level] = (
-                    w0 * table[i0, 0] + w1 * table[i1, 0] + w2 * table[i2, 0] + w3 * table[i3, 0]
-                    + w4 * table[i4, 0] + w5 * table[i5, 0] + w6 * table[i6, 0] + w7 * table[i7, 0]
-                )  # fmt: skip
-                out[i, 2 * level + 1] = (
-                    w0 * table[i0, 1] + w1 * table[i1, 1] + w2 * table[i2, 1] + w3 * table[i3, 1]
-                    + w4 * table[i4, 1] + w5 * table[i5, 1] + w6 * table[i6, 1] + w7 * table[i7, 1]
-                )  # fmt: skip
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
 
 
-@njit(cache=True, inline="always")
-def _add(table, row, weight, a, b):  # type: ignore[no-untyped-def]
-    table[row, 0] += weight * a
-    table[row, 1] += weight * b
+def _table_gradient(table: Tensor) -> np.ndarray:
+    if table.grad is None:
+        table.grad = torch.zeros_like(table)
+    return table.grad.numpy()
 
 
-@njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _encode_backward(positions, gradient, resolutions, offsets, active, out):  # type: ignore[no-untyped-def]
-    count = positions.shape[0]
-    for level in prange(active):
-        resolution = np.int32(resolutions[level])
-        rows = offsets[level + 1] - offsets[level]
-        dense = (np.int64(resolution) + 1) ** 3 <= rows
-        mask = np.uint32(rows - 1)
-        table = out[offsets[level] : offsets[level + 1]]
-        for i in range(count):
-            a = gradient[i, 2 * level]
-            b = gradient[i, 2 * level + 1]
-            if a == 0.0 and b == 0.0:
-                continue
-            x, y, z, fx, fy, fz = _cell(positions, i, resolution)
-            i0, i1, i2, i3, i4, i5, i6, i7 = _corners(x, y, z, resolution, mask, dense)
-            w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
-            _add(table, i0, w0, a, b)
-            _add(table, i1, w1, a, b)
-            _add(table, i2, w2, a, b)
-            _add(table, i3, w3, a, b)
-            _add(table, i4, w4, a, b)
-            _add(table, i5, w5, a, b)
-            _add(table, i6, w6, a, b)
-            _add(table, i7, w7, a, b)
+def _grid(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return _array(grid.table), grid.resolutions.numpy(), grid.offsets.numpy()
 
 
-@njit(cache=True, nogil=True)
-def _walk(ox, oy, oz, dx, dy, dz, near, far, jitter, states, step, t_out, write):  # type: ignore[no-untyped-def]
-    """One ray of ``march``: returns its sample count and, when asked, writes the samples."""
-    grid = states.shape[0]
-    half = np.float32(0.5 * grid)
-    kept = 0
-    k = 0
-    while True:
-        t = near + (np.float32(k) + jitter) * step
-        if not t < far:  # also ends on NaN
-            break
-        x = min(max(int((ox + dx * t + np.float32(1.0)) * half), 0), grid - 1)
-        y = min(max(int((oy + dy * t + np.float32(1.0)) * half), 0), grid - 1)
-        z = min(max(int((oz + dz * t + np.float32(1.0)) * half), 0), grid - 1)
-        state = states[x, y, z]
-        if state == 0:
-            # where the ray leaves this cell, less one step for rounding: points of the lattice in between are all outside
-            leave = far
-            for axis in range(3):
-                o = ox if axis == 0 else (oy if axis == 1 else oz)
-                d = dx if axis == 0 else (dy if axis == 1 else dz)
-                c = x if axis == 0 else (y if axis == 1 else z)
-                if abs(d) > 1e-9:
-                    face = np.float32(c + (1 if d > 0 else 0)) / half - np.float32(1.0)
-                    leave = min(leave, (face - o) / d)
-            k += max(1, int((leave - t) / step))
-            continue
-        if write:
-            t_out[kept] = t
-        kept += 1
-        if state == 2 and kept >= 2:
-            break
-        k += 1
-    return kept
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def _march_count(origins, directions, near, far, jitter, states, step, counts):  # type: ignore[no-untyped-def]
-    unused = np.empty(0, np.float32)
-    for r in prange(origins.shape[0]):
-        o = origins[r]
-        d = directions[r]
-        counts[r] = _walk(o[0], o[1], o[2], d[0], d[1], d[2], near[r], far[r], jitter[r], states, step, unused, False)
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def _march_fill(origins, directions, near, far, jitter, states, step, offsets, t, ray):  # type: ignore[no-untyped-def]
-    for r in prange(origins.shape[0]):
-        o = origins[r]
-        d = directions[r]
-        begin, end = offsets[r], offsets[r + 1]
-        _walk(o[0], o[1], o[2], d[0], d[1], d[2], near[r], far[r], jitter[r], states, step, t[begin:end], True)
-        ray[begin:end] = r
-
-
-@njit(cache=True, inline="always")
-def _softplus(x):  # type: ignore[no-untyped-def]
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
-
-
-@njit(cache=True, inline="always")
-def _sigmoid(x):  # type: ignore[no-untyped-def]
-    e = math.exp(-abs(x))
-    return 1.0 / (1.0 + e) if x >= 0 else e / (1.0 + e)
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def _sections(sdf, sharpness, offsets, weights, crossing):  # type: ignore[no-untyped-def]
-    for r in prange(offsets.shape[0] - 1):
-        depth = 0.0
-        for i in range(offsets[r], offsets[r + 1]):
-            crossing[i] = 0.5
-            weights[i] = 0.0
-            if i + 1 < offsets[r + 1]:
-                f0 = sdf[i]
-                f1 = sdf[i + 1]
-                # softplus(-s f) differences in double: at s = 1e6 single precision would leave 0.1 of noise
-                tau = max(0.0, _softplus(-sharpness * np.float64(f1)) - _softplus(-sharpness * np.float64(f0)))
-                weights[i] = math.exp(-depth) * -math.expm1(-tau)
-                depth += tau
-                if f0 > 0 and f1 <= 0:
-                    crossing[i] = f0 / (f0 - f1)
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def _sections_backward(sdf, sharpness, offsets, gradient, out):  # type: ignore[no-untyped-def]
-    for r in prange(offsets.shape[0] - 1):
-        begin, end = offsets[r], offsets[r + 1]
-        for i in range(begin, end):
-            out[i] = 0.0
-        # first pass forward: the total of gradient times weight; second: what is left behind each section
-        depth = 0.0
-        total = 0.0
-        for i in range(begin, end - 1):
-            tau = max(0.0, _softplus(-sharpness * np.float64(sdf[i + 1])) - _softplus(-sharpness * np.float64(sdf[i])))
-            total += gradient[i] * math.exp(-depth) * -math.expm1(-tau)
-            depth += tau
-        depth = 0.0
-        for i in range(begin, end - 1):
-            tau = _softplus(-sharpness * np.float64(sdf[i + 1])) - _softplus(-sharpness * np.float64(sdf[i]))
-            if tau > 0.0:
-                transmittance = math.exp(-depth)
-                total -= gradient[i] * transmittance * -math.expm1(-tau)
-                d_tau = gradient[i] * transmittance * math.exp(-tau) - total
-                out[i] += d_tau * sharpness * _sigmoid(-sharpness * np.float64(sdf[i]))
-                out[i + 1] -= d_tau * sharpness * _sigmoid(-sharpness * np.float64(sdf[i + 1]))
-                depth += tau
-
-
-class _HashEncode(torch.autograd.Function):
+class _Value(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, table, resolutions, offsets, active):  # type: ignore[no-untyped-def]
-        levels = resolutions.shape[0]
-        ctx.active = min(active, levels)
-        out = torch.empty(positions.shape[0], 2 * levels)
-        out[:, 2 * ctx.active :] = 0.0
-        _encode(positions.detach().numpy(), table.detach().numpy(), resolutions.numpy(), offsets.numpy(), ctx.active, out.numpy())
-        ctx.save_for_backward(positions, resolutions, offsets)
-        ctx.rows = table.shape[0]
+    def forward(ctx: Any, keep: bool, positions: Tensor, surface: Surface, active: int, weight: Tensor, last: Tensor) -> Tensor:
+        count = len(positions)
+        chunks = -(-count // POINTS)
+        units, width = weight.shape
+        sizes = {"block": (np.float32, width * POINTS), "hidden": (np.float32, units * POINTS), **_network(weight)}
+        store = _Store(chunks if keep else get_num_threads(), sizes)
+        out = torch.empty(count)
+        cpu_rays.surface_forward(
+            _array(positions), np.float32(surface.grid.extent), surface.spheres, *_grid(surface.grid), active,
+            _array(weight), _array(last), keep, *store.take("block hidden"), out.numpy(),
+        )  # fmt: skip
+        if keep:
+            ctx.store, ctx.surface, ctx.active = store, surface, active
+            ctx.save_for_backward(weight, last)
         return out
 
     @staticmethod
-    def backward(ctx, gradient):  # type: ignore[no-untyped-def]
-        positions, resolutions, offsets = ctx.saved_tensors
-        out = torch.zeros(ctx.rows, 2)
-        arrays = (x.numpy() for x in (positions.detach(), gradient.contiguous(), resolutions, offsets))
-        _encode_backward(*arrays, ctx.active, out.numpy())  # type: ignore[call-arg]
-        return None, out, None, None, None
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        weight, last = ctx.saved_tensors
+        store, surface, count = ctx.store, ctx.surface, len(gradient)
+        chunks = -(-count // POINTS)
+        extent, grid = np.float32(surface.grid.extent), _grid(surface.grid)
+        positions = torch.empty(count if ctx.needs_input_grad[1] else 0, 3)
+        weight_out, last_out = store.take("weight_out last_out")
+        weight_out = weight_out.reshape(len(weight_out), *weight.shape)
+        cpu_rays.surface_backward(
+            _array(gradient), extent, surface.spheres, *grid, ctx.active, _array(weight), _array(last),
+            *store.take("block hidden row"), weight_out, last_out, ctx.needs_input_grad[1], positions.numpy(),
+        )  # fmt: skip
+        if surface.grid.table.requires_grad:
+            cpu_rays.surface_scatter(count, extent, *grid[1:], ctx.active, *store.take("block"), _table_gradient(surface.grid.table))
+        ctx.store = None
+        weights = torch.from_numpy(weight_out[:chunks].sum(0)), torch.from_numpy(last_out[:chunks].sum(0))
+        return None, positions if ctx.needs_input_grad[1] else None, None, None, *weights
 
 
-class _SectionWeights(torch.autograd.Function):
+class _Trace(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, sdf, sharpness, offsets):  # type: ignore[no-untyped-def]
-        weights, crossing = torch.empty_like(sdf), torch.empty_like(sdf)
-        _sections(sdf.detach().numpy(), sharpness, offsets.numpy(), weights.numpy(), crossing.numpy())
-        ctx.save_for_backward(sdf, offsets)
-        ctx.sharpness = sharpness
-        ctx.mark_non_differentiable(crossing)
-        return weights, crossing
+    def forward(
+        ctx: Any, keep: bool, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, jitter: Tensor, states: Tensor,
+        sampling: Sampling, surface: Surface, appearance: HashGrid, weight: Tensor, last: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+        count = len(origins)
+        chunks = -(-count // CHUNK)
+        store = _Store(chunks if keep else get_num_threads(), _ray_stores(weight, len(appearance.resolutions)))
+        features = torch.empty(count, appearance.width)
+        opacity, shown, depth = torch.empty(count), torch.empty(count), torch.empty(count)
+        samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
+        s, f = sampling, np.float32
+        names = "block hidden sdf ray_of time_of t_of f_of p_of id_of counts rounds sizes s_block s_ray s_k s_time s_weight s_count"
+        cpu_rays.trace_forward(
+            *(_array(x) for x in (origins, directions, near, far, jitter, states)), f(surface.grid.extent), surface.grid.extent > 1.0,
+            float(s.sharpness), f(s.step), f(s.stride), f(s.grazing), f(s.significant), float(s.opaque),
+            surface.spheres, *_grid(surface.grid), s.active_surface, _array(weight), _array(last), *_grid(appearance), s.active_radiance,
+            keep, *store.take(names), features.numpy(), opacity.numpy(), shown.numpy(), depth.numpy(), samples.numpy(),
+        )  # fmt: skip
+        if keep:
+            ctx.store, ctx.parts = store, (surface, appearance, sampling)
+            ctx.save_for_backward(weight, last, origins, directions, features, shown)
+        ctx.mark_non_differentiable(depth, samples)
+        return features, opacity, depth, samples.sum()
 
     @staticmethod
-    def backward(ctx, gradient, _):  # type: ignore[no-untyped-def]
-        sdf, offsets = ctx.saved_tensors
-        out = torch.empty_like(sdf)
-        _sections_backward(sdf.detach().numpy(), ctx.sharpness, offsets.numpy(), gradient.contiguous().numpy(), out.numpy())
-        return out, None, None
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, g_features: Tensor, g_opacity: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        weight, last, origins, directions, features, shown = ctx.saved_tensors
+        (surface, appearance, s), store, count = ctx.parts, ctx.store, len(features)
+        chunks = -(-count // CHUNK)
+        extent, grid, look = np.float32(surface.grid.extent), _grid(surface.grid), _grid(appearance)
+        weight_out, last_out = store.take("weight_out last_out")
+        weight_out = weight_out.reshape(len(weight_out), *weight.shape)
+        cpu_rays.trace_backward(
+            count, _array(g_features), _array(g_opacity), _array(features), _array(shown), float(s.sharpness),
+            s.active_surface, _array(weight), _array(last), s.active_radiance,
+            *store.take("block hidden sdf p_of id_of counts rounds sizes s_block s_ray s_k s_weight s_count row"), weight_out, last_out,
+        )  # fmt: skip
+        rays: list[Tensor | None] = [None, None]
+        if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
+            rays = [torch.empty_like(origins), torch.empty_like(directions)]
+            cpu_rays.trace_rays_backward(
+                _array(origins), _array(directions), extent, extent > 1.0, surface.spheres, *grid, s.active_surface, _array(weight),
+                *look, s.active_radiance,
+                *store.take("block hidden sdf ray_of time_of rounds sizes s_block s_ray s_time s_count"),
+                *(_array(r) for r in rays if r is not None),
+            )  # fmt: skip
+        if surface.grid.table.requires_grad or appearance.table.requires_grad:
+            cpu_rays.trace_scatter(
+                count, extent, *grid[1:], s.active_surface, *store.take("block rounds sizes"), _table_gradient(surface.grid.table),
+                *look[1:], s.active_radiance, *store.take("s_block s_count"), _table_gradient(appearance.table),
+            )  # fmt: skip
+        ctx.store = None
+        weights = torch.from_numpy(weight_out[:chunks].sum(0)), torch.from_numpy(last_out[:chunks].sum(0))
+        return None, *rays, *[None] * 7, *weights
 
 
-def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
-    """See ``reference.hash_encode``; float32, F = 2, differentiable in ``table`` alone."""
-    return _HashEncode.apply(positions.contiguous(), table, resolutions, offsets, active)
+def _kept(*tensors: Tensor) -> bool:
+    """Whether a backward pass may follow; within ``forward`` autograd does not tell."""
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def march(
-    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, jitter: Tensor, states: Tensor, step: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """See ``reference.march``; float32."""
-    rays = origins.shape[0]
-    arrays = [x.contiguous().numpy() for x in (origins, directions, near, far, jitter, states)]
-    counts = np.empty(rays, np.int64)
-    _march_count(*arrays, np.float32(step), counts)  # type: ignore[call-arg]
-    offsets = np.zeros(rays + 1, np.int64)
-    np.cumsum(counts, out=offsets[1:])
-    t, ray = np.empty(offsets[-1], np.float32), np.empty(offsets[-1], np.int64)
-    _march_fill(*arrays, np.float32(step), offsets, t, ray)  # type: ignore[call-arg]
-    return torch.from_numpy(t), torch.from_numpy(ray), torch.from_numpy(offsets)
+def surface_value(surface: Surface, positions: Tensor, active: int) -> Tensor:
+    """See ``Surface.forward``; float32. Differentiable in positions, weights, and, in place, the table."""
+    active = min(active, len(surface.grid.resolutions))
+    return _Value.apply(_kept(positions, surface.hidden), positions, surface, active, surface.hidden, surface.last)
 
 
-def section_weights(sdf: Tensor, sharpness: float, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """See ``reference.section_weights``; float32 in and out, double inside."""
-    return _SectionWeights.apply(sdf.contiguous(), float(sharpness), offsets)
+def trace(
+    surface: Surface, appearance: HashGrid, states: Tensor, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor,
+    jitter: Tensor, sampling: Sampling,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """See ``rendering.trace``; float32. Differentiable in origins, directions, weights, and, in place, the tables."""
+    active = min(sampling.active_surface, len(surface.grid.resolutions)), min(sampling.active_radiance, len(appearance.resolutions))
+    sampling = replace(sampling, active_surface=active[0], active_radiance=active[1])
+    keep = _kept(origins, directions, surface.hidden)
+    return _Trace.apply(keep, origins, directions, near, far, jitter, states, sampling, surface, appearance, surface.hidden, surface.last)
+
+
+@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def _adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for i in range(p.shape[0]):
+        a = beta1 * m[i] + (one - beta1) * g[i]
+        b = beta2 * v[i] + (one - beta2) * g[i] * g[i]
+        m[i] = a
+        v[i] = b
+        p[i] -= rate * a / (np.float32(math.sqrt(b)) * root + epsilon)
+        g[i] = zero
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _adam(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
+    """``rate`` includes the first bias correction, ``root`` is one over the square root of the second."""
+    count = p.shape[0]
+    for chunk in prange((count + 16383) // 16384):
+        begin = np.int64(chunk) * 16384
+        end = min(count, begin + 16384)
+        _adam_part(p[begin:end], g[begin:end], m[begin:end], v[begin:end], rate, beta1, beta2, root, epsilon)
+
+
+def adam(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, beta1: float, beta2: float, epsilon: float, count: int
+) -> None:
+    """See ``reference.adam``; float32."""
+    arrays = (x.detach().view(-1).numpy() for x in (parameter, gradient, first, second))
+    f = np.float32
+    _adam(*arrays, f(rate / (1 - beta1**count)), f(beta1), f(beta2), f(1 / math.sqrt(1 - beta2**count)), f(epsilon))  # type: ignore[call-arg]
+
+
+_KERNELS = (
+    cpu_rays.surface_forward, cpu_rays.surface_backward, cpu_rays.surface_scatter, cpu_rays.trace_forward, cpu_rays.trace_backward,
+    cpu_rays.trace_scatter, _adam,
+)  # fmt: skip
 
 
 def is_compiled() -> bool:
-    """Whether every kernel has code for its usual types, in this process or in the cache on disk."""
-    kernels = (_encode, _encode_backward, _march_count, _march_fill, _sections, _sections_backward)
-    return all(k.signatures or _cached(k) for k in kernels)
+    """Whether every kernel of a fit has code for its usual types, in this process or in the cache on disk."""
+    return all(k.signatures or _cached(k) for k in _KERNELS)
 
 
-def _cached(kernel) -> bool:  # type: ignore[no-untyped-def]
+def _cached(kernel: Any) -> bool:
     # numba writes one index file per function and source version; it is missing exactly when the kernel was never compiled
     cache = kernel._cache._cache_file
     return bool(cache.load_index() if hasattr(cache, "load_index") else cache._load_index())
-
-
-def compile_all() -> None:
-    """Run every kernel once on a tiny input, so that compilation happens here and not within a timed loop."""
-    table = torch.zeros(91, 2, requires_grad=True)
-    hash_encode(torch.rand(4, 3), table, torch.tensor([2, 5]), torch.tensor([0, 27, 91]), 2).sum().backward()
-    ray = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.zeros(2), torch.ones(2), torch.rand(2)
-    _, _, offsets = march(*ray, torch.ones(4, 4, 4, dtype=torch.uint8), 0.1)
-    sdf = torch.linspace(1, -1, int(offsets[-1]), requires_grad=True)
-    section_weights(sdf, 10.0, offsets)[0].sum().backward()

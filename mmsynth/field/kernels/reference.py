@@ -6,12 +6,21 @@ Symbols: N samples, R rays, L levels, T rows of all levels, F features per level
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+if TYPE_CHECKING:
+    from mmsynth.field.rendering import Sampling
+
+MOST = 96  # samples of one ray
+_SKIP = 0.25  # of the distance from the centre: the longest step in contracted space
+_ONWARD = 1.0 + 2.0**-22  # the least that a float32 moves on: a short step far from a ray's origin may round to none
 PRIMES = (1, 2654435761, 805459861)
-OUTSIDE, SHELL, SOLID = 0, 1, 2
+SHELL, SOLID, OUTSIDE = 0, 1, 2  # and more than OUTSIDE: half cells that are certainly free around the cell
 
 
 def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
@@ -45,34 +54,128 @@ def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: 
     return out.reshape(positions.shape[0], levels * features)
 
 
-def march(
-    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, jitter: Tensor, states: Tensor, step: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Sample the rays where the three-state grid says a surface may be.
+def contract(positions: Tensor) -> Tensor:
+    """All of space into a ball of radius 2 (mip-NeRF 360, Barron et al. 2022, eq. 10); the unit ball stays as it is."""
+    norm = torch.linalg.vector_norm(positions, dim=-1, keepdim=True).clamp(min=1.0)
+    return positions / norm * (2.0 - 1.0 / norm)
 
-    Each ray is a lattice t = near + (k + jitter) step < far. Lattice points in outside cells are skipped; a point in a
-    solid cell is kept and ends the ray, at its second sample at the earliest: a ray that starts inside has one section, too.
+
+def contracted_velocity(positions: Tensor, directions: Tensor) -> Tensor:
+    """Change of the contracted position per unit of distance along the directions, (N, 3)."""
+    norm = torch.linalg.vector_norm(positions, dim=-1, keepdim=True).clamp(min=1.0)
+    unit = positions / norm
+    along = (unit * directions).sum(-1, keepdim=True)
+    across = (2.0 * norm - 1.0) / norm**2
+    moved = directions * across + unit * along * (1.0 / norm**2 - across)
+    return torch.where(norm > 1.0, moved, directions)
+
+
+def _advance(
+    origins: Tensor, directions: Tensor, t: Tensor, far: Tensor, jitter: Tensor, states: Tensor, extent: float, step: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The first place at or after t where a surface may be: t, position, distance from the centre, speed, state, per ray."""
+    grid = states.shape[0]
+    half = 0.5 * grid / extent
+    t = t.clone()
+    skipped = torch.zeros_like(t, dtype=torch.bool)
+    while True:
+        points = origins + directions * t[:, None]
+        reach = torch.linalg.vector_norm(points, dim=-1).clamp(min=1.0)
+        where = contract(points) if extent > 1 else points
+        velocity = contracted_velocity(points, directions) if extent > 1 else directions
+        speed = torch.linalg.vector_norm(velocity, dim=-1)
+        cell = ((where + extent) * half).long().clamp(0, grid - 1)
+        state = states[cell[:, 0], cell[:, 1], cell[:, 2]]
+        skip = (t < far) & (state >= OUTSIDE)
+        if not bool(skip.any()):
+            break
+        face = (cell + (velocity > 0)) / half - extent
+        leave = torch.where(velocity.abs() > 1e-9, (face - where) / velocity, torch.full_like(where, 1e9)).amin(-1)
+        # the cell's certificate may reach beyond it
+        leave = torch.maximum(leave.clamp(min=0.0), (state.to(t) - OUTSIDE) / (2.0 * half * speed)) + 0.1 * step / speed
+        if extent > 1:
+            leave = torch.minimum(leave, _SKIP * reach)
+        t = torch.where(skip, torch.maximum(t + leave, t * _ONWARD), t)
+        skipped |= skip
+    # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
+    entered = skipped & (t < far)
+    t = torch.where(entered, t + jitter * step / speed, t)
+    points = origins + directions * t[:, None]
+    return t, contract(points) if extent > 1 else points, reach, speed, state
+
+
+def march(
+    sdf: Callable[[Tensor], Tensor],
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    jitter: Tensor,
+    states: Tensor,
+    extent: float,
+    sampling: Sampling,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample rays where the three-state grid says that a surface may be, guided by the distance at the samples.
+
+    Outside cells are skipped, by the distance that they certify. From a sample with distance f, a ray goes on by
+    step / slope, the slope being how fast f fell since the last sample, or by ``stride`` (f - 3 / s) where that is longer. It
+    ends in a solid cell (at its second sample at the earliest), at an optical depth of ``opaque``, and after ``MOST`` samples.
 
     Args:
-        origins, directions: (R, 3), the grid spans [-1, 1]³. near, far, jitter: (R,). states: (G, G, G) uint8.
+        sdf: (N, 3) → (N,). origins, directions: (R, 3). near, far, jitter: (R,).
+        states: (G, G, G) uint8 over [-extent, extent]³; space is contracted when extent > 1.
     Returns:
         t (N,), ray (N,) int64, offsets (R + 1,) int64.
     """
-    grid = states.shape[0]
-    count = int(torch.ceil((far - near).max().clamp(min=0) / step)) + 1 if near.numel() else 1
-    k = torch.arange(count, device=near.device, dtype=near.dtype)
-    t = near[:, None] + (k + jitter[:, None]) * step
-    inside = t < far[:, None]
-    point = origins[:, None] + directions[:, None] * t[..., None]
-    cell = ((point + 1) * (0.5 * grid)).long().clamp(0, grid - 1)
-    state = states[cell[..., 0], cell[..., 1], cell[..., 2]]
-    candidate = inside & (state != OUTSIDE)
-    ends = candidate & (state == SOLID) & (candidate.long().cumsum(1) >= 2)
-    keep = candidate & (ends.long().cumsum(1) - ends.long() == 0)
-    ray = torch.arange(near.shape[0], device=near.device)[:, None].expand_as(t)[keep]
-    offsets = torch.zeros(near.shape[0] + 1, dtype=torch.int64, device=near.device)
-    offsets[1:] = keep.sum(1).cumsum(0)
-    return t[keep], ray, offsets
+    rays = len(origins)
+    s = sampling
+    t = near + jitter * s.step
+    going = torch.arange(rays, device=t.device)
+    last = torch.zeros_like(t), torch.zeros_like(t)  # the last sample: where, distance
+    depth = torch.zeros_like(t)
+    found: list[tuple[Tensor, Tensor]] = []
+    for k in range(MOST):
+        here = going
+        at, where, reach, speed, state = _advance(origins[here], directions[here], t[here], far[here], jitter[here], states, extent, s.step)
+        alive = at < far[here]
+        here, at, where, reach, speed, state = (x[alive] for x in (here, at, where, reach, speed, state))
+        if not len(here):
+            break
+        f = sdf(where)
+        found.append((here, at))
+        slope = torch.ones_like(f)
+        if k:
+            tau = softplus(-s.sharpness * f.double()) - softplus(-s.sharpness * last[1][here].double())
+            depth[here] += tau.clamp(min=0.0).to(f)
+            slope = (last[1][here] - f) / ((at - last[0][here]) * speed)
+        last[0][here], last[1][here] = at, f
+        jump = s.step / slope.clamp(min=s.grazing)
+        jump = torch.where(f > 0, torch.maximum(jump, s.stride * (f - 3.0 / s.sharpness)), jump) / speed
+        if extent > 1:
+            jump = torch.minimum(jump, _SKIP * reach)
+        t[here] = at + jump
+        going = here[(depth[here] <= s.opaque) & ~((state == SOLID) & (k > 0))]
+        if not len(going):
+            break
+    if not found:
+        return t[:0], going[:0], torch.zeros(rays + 1, dtype=torch.int64, device=t.device)
+    ray, at = torch.cat([r for r, _ in found]), torch.cat([x for _, x in found])
+    order = torch.argsort(ray, stable=True)
+    offsets = torch.zeros(rays + 1, dtype=torch.int64, device=t.device)
+    offsets[1:] = torch.bincount(ray, minlength=rays).cumsum(0)
+    return at[order], ray[order], offsets
+
+
+def exclusive_sum(values: Tensor, offsets: Tensor, ray: Tensor) -> Tensor:
+    """Sum of the values before each sample of the same ray; packed (N,), offsets (R + 1,), ray (N,)."""
+    if not len(values):
+        return values
+    # per ray and not one long sum over all rays: in float32 that would leave an error of the size of the total
+    lengths = offsets[1:] - offsets[:-1]
+    padded = torch.zeros(len(lengths), int(lengths.max()) + 1, dtype=values.dtype, device=values.device)
+    column = torch.arange(len(values), device=values.device) - offsets[ray]
+    padded = padded.index_put((ray, column + 1), values)
+    return padded.cumsum(1)[ray, column]
 
 
 def section_weights(sdf: Tensor, sharpness: float, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -95,17 +198,24 @@ def section_weights(sdf: Tensor, sharpness: float, offsets: Tensor) -> tuple[Ten
     following = torch.cat([sdf[1:], sdf[-1:]])
     tau = torch.relu(softplus(-sharpness * following) - softplus(-sharpness * sdf))
     tau = torch.where(last, torch.zeros_like(tau), tau)
-    before = tau.cumsum(0) - tau
     ray = torch.repeat_interleave(torch.arange(offsets.shape[0] - 1, device=sdf.device), offsets[1:] - offsets[:-1])
-    start = before[offsets[:-1].clamp(max=max(count - 1, 0))][ray] if count else before
-    weights = torch.exp(start - before) * -torch.expm1(-tau)
+    weights = torch.exp(-exclusive_sum(tau, offsets, ray)) * -torch.expm1(-tau)
     with torch.no_grad():
         crosses = (sdf > 0) & (following <= 0) & ~last
         crossing = torch.where(crosses, sdf / torch.where(crosses, sdf - following, torch.ones_like(sdf)), torch.full_like(sdf, 0.5))
     return weights, crossing
 
 
-def accumulate(weights: Tensor, values: Tensor, ray: Tensor, rays: int) -> Tensor:
-    """Σ over the samples of each ray of weight times value: weights (M,), values (M, F), ray (M,) → (R, F)."""
-    out = torch.zeros(rays, values.shape[1], dtype=values.dtype, device=values.device)
-    return out.index_add(0, ray, weights[:, None] * values)
+@torch.no_grad()
+def adam(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, beta1: float, beta2: float, epsilon: float, count: int
+) -> None:
+    """One step of Adam (Kingma and Ba 2015, algorithm 1), in place; the gradient is cleared.
+
+    Args:
+        parameter, gradient, first, second: one shape; the moments are updated. count: 1 at the first step.
+    """
+    first.mul_(beta1).add_(gradient, alpha=1 - beta1)
+    second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    parameter.addcdiv_(first, (second / (1 - beta2**count)).sqrt_().add_(epsilon), value=-rate / (1 - beta1**count))
+    gradient.zero_()

@@ -1,0 +1,120 @@
+"""What a field says in the world's frame and unit, and its shader."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn.functional import normalize, softplus
+
+from mmsynth.field import kernels
+from mmsynth.field.field import Design, Field
+from mmsynth.field.radiance import Shader, intensity, radiance
+from mmsynth.scene.scene import Region, Sensor
+from mmsynth.sensors.polarization import coherency_from_factor
+
+RGB = Sensor("rgb", ("R", "G", "B"), (None, None, None))
+POL = Sensor("pol", ("0", "45", "90", "135"), (None,) * 4, None, (0.0, 45.0, 90.0, 135.0))
+NIR = Sensor("nir", ("nir",), (850.0,))
+SENSORS, LEVELS = {s.name: s for s in (RGB, POL, NIR)}, {"rgb": 0.5, "pol": 0.25, "nir": 2.0}
+
+
+def _field(background: bool, region: Region | None = None) -> Field:
+    torch.manual_seed(0)
+    design = Design(
+        surface_levels=2, radiance_levels=2, surface_rows_log2=12, radiance_rows_log2=10, surface_finest=128, radiance_finest=12,
+        background=background, horizon=1.9, surface_hidden=8, radiance_hidden=8, coarsest=5, occupancy=16,
+    )  # fmt: skip
+    field = Field(design, SENSORS, LEVELS, region or Region((0.0, 0.0, 0.0), 1.0))
+    with torch.no_grad():
+        field.surface.last.normal_(0, 0.05)
+        field.appearance.table.normal_()
+    field.sampling = replace(field.sampling, sharpness=400.0, step=0.005)
+    return field
+
+
+def _look_around(field: Field, count: int) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+    directions = normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    origins = torch.tensor([[0.75, 0.0, 0.0]]).expand(count, 3)
+    x = normalize(torch.linalg.cross(directions, torch.tensor([[0.1, 0.2, 1.0]]).expand(count, 3)), dim=1)
+    return origins, directions, field.render_rays(origins, directions, x, list(SENSORS), True)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_normals_are_those_of_the_surface_that_is_seen(background: bool) -> None:
+    """With a background the surface lies in contracted space: its normals do not."""
+    field = _field(background)
+    origins, directions, out = _look_around(field, 300)
+    hit = torch.isfinite(out["depth"])
+    points = (origins + directions * out["depth"][:, None])[hit].double().requires_grad_()
+    field.double()
+    place = kernels.contract(points) if background else points
+    value = field.surface.reference(place, field.sampling.active_surface)
+    apart = value.detach().abs()  # the depth is where the surface is; where a ray grazes it, within the soft part
+    assert float(apart.quantile(0.95)) < 0.1 * field.sampling.step and float(apart.max()) < 3.5 / field.sampling.sharpness
+    (slope,) = torch.autograd.grad(value.sum(), points)
+    # differences over a cell: off by its size times the curvature
+    assert float((normalize(slope, dim=1) * out["normal"][hit]).sum(1).min()) > 0.98
+    far = points.detach().norm(dim=1) > 1.0
+    assert hit.sum() > 30 and (not background or (far.sum() > 150 and hit.sum() > 270))
+    assert out["normal"][~hit].isnan().all()
+
+
+def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
+    field = _field(True, Region((10.0, 0.0, -5.0), 3.0))
+    x = np.array([[10.0, 0.0, -5.0], [10.0, 1.8, -5.0], [10.0, 0.0, 25.0], [-300.0, 200.0, 0.0]])
+    unit = torch.from_numpy((x - [10.0, 0.0, -5.0]) / 3.0)
+    expected = 3.0 * field.double().surface.reference(kernels.contract(unit), 2)
+    np.testing.assert_allclose(field.float().sdf(x), expected.detach().numpy(), atol=1e-5)
+    assert field.sdf(np.empty((0, 3))).shape == (0,)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_what_rays_see_is_the_shader_of_their_features(background: bool) -> None:
+    from mmsynth.field import rendering
+
+    field = _field(background)
+    origins, directions, out = _look_around(field, 200)
+    hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((200,), 0.5), field.sampling)
+    assert torch.equal(out["opacity"], hits.opacity.clamp(0, 1)) and torch.equal(out["depth"].nan_to_num(), hits.depth.nan_to_num())
+    nothing = hits.opacity == 0
+    assert nothing.any() or background
+    for name in SENSORS:
+        assert out[name].shape == (200, SENSORS[name].channel_count)
+        assert (out[name][~nothing] > 0).all() and not out[name][nothing].any()
+    i0, i45, i90, i135 = out["pol"].unbind(1)
+    s0, s1, s2 = out["stokes/pol"].unbind(1)
+    for found, expected in ((s0, i0 + i90), (s0, i45 + i135), (s1, i0 - i90), (s2, i45 - i135)):
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    assert (torch.hypot(s1, s2) <= s0 * (1 + 1e-5)).all()
+
+
+def test_modalities_have_their_own_outputs() -> None:
+    shader = Shader(4, 8, SENSORS, LEVELS)
+    assert {n: (c.start, c.stop) for n, c in shader.columns.items()} == {"rgb": (0, 3), "pol": (3, 9), "nir": (9, 10)}
+    assert shader.heads.out_features == 10
+    outputs = torch.randn(5, 10, requires_grad=True)
+    torch.testing.assert_close(shader.values("rgb", outputs), 0.5 * softplus(outputs[:, :3]))
+    torch.testing.assert_close(shader.values("nir", outputs), 2.0 * softplus(outputs[:, 9:]))
+    axes = normalize(torch.randn(5, 2, 3), dim=-1)
+    j = coherency_from_factor(outputs[:, 3:9])
+    expected = 0.25 * torch.einsum("rki,rij,rkj->rk", axes, j @ j.mT, axes)
+    torch.testing.assert_close(shader.values("pol", outputs, axes), expected)
+    (gradient,) = torch.autograd.grad(shader.values("pol", outputs, axes).sum(), outputs)
+    assert gradient[:, 3:9].all() and not gradient[:, :3].any() and not gradient[:, 9:].any()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-30, 30, width=32), min_size=6, max_size=6), st.floats(0, 7))
+def test_light_is_never_negative(raw: list[float], angle: float) -> None:
+    numbers = torch.tensor(raw)
+    axes = torch.tensor([[np.cos(angle), np.sin(angle), 0.0], [0.0, 0.6, -0.8]], dtype=torch.float32)
+    assert (radiance(numbers) >= 0).all() and (intensity(numbers, axes) >= 0).all()
+    # any two crossed analysers let the same light through in sum, and none lets more: DoLP ≤ 1
+    crossed = torch.tensor([[-np.sin(angle), np.cos(angle), 0.0]], dtype=torch.float32)
+    total = intensity(numbers, torch.eye(3)[:2]).sum()
+    torch.testing.assert_close(intensity(numbers, axes[:1]).sum() + intensity(numbers, crossed).sum(), total, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,144 @@
+"""What a fit finds that its scene needs, on scenes whose needs are known: a ball in a black room, and one in a painted room."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mmsynth.fitting.measurements import load_measurements
+from mmsynth.fitting.needs import Needs, assess
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.trainer import Trainer
+from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import Scene, keep_frames
+
+SIZE, FOCAL, VIEWS = 36, 48.0, 14
+SMALL = {
+    "samples_per_step": 4096, "rays_at_start": 256, "surface_rows_log2": 12, "radiance_rows_log2": 13, "occupancy_resolution": 24,
+    "eikonal_points": 128, "radiance_hidden": 32, "view_dependence_from": 0.2,
+}  # fmt: skip
+
+
+def _pose(angle: float, height: float) -> np.ndarray:
+    """OpenGL camera_to_world that looks at the origin."""
+    eye = np.array([2.6 * np.cos(angle), 2.6 * np.sin(angle), height])
+    back = eye / np.linalg.norm(eye)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, eye], 1)
+    return pose
+
+
+def _picture(pose: np.ndarray, gloss: float, room: bool) -> np.ndarray:
+    """A ball of radius 0.7 with bands of colour, a highlight of the given strength, and a painted room around it or none."""
+    v, u = np.mgrid[:SIZE, :SIZE]
+    local = np.stack([(u - (SIZE - 1) / 2) / FOCAL, -(v - (SIZE - 1) / 2) / FOCAL, -np.ones_like(u, float)], -1)
+    d = local @ pose[:3, :3].T
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    o = pose[:3, 3]
+    b = d @ o
+    inside = b**2 - (o @ o - 0.7**2)
+    hit = inside > 0
+    n = (o + d * (-b - np.sqrt(np.maximum(inside, 0)))[..., None]) / 0.7
+    bands = np.stack([0.4 + 0.25 * np.sin(4 * n[..., 0]), 0.4 + 0.25 * np.sin(4 * n[..., 1] + 1), 0.35 + 0.2 * np.cos(4 * n[..., 2])], -1)
+    light = np.array([0.5, 0.2, 0.84])
+    mirrored = d - 2 * (d * n).sum(-1, keepdims=True) * n
+    ball = bands + gloss * np.clip(mirrored @ light, 0, 1)[..., None] ** 3
+    behind = 0.35 + 0.2 * np.sin(5 * d) if room else np.zeros_like(ball)
+    return np.where(hit[..., None], ball, behind)
+
+
+def _scene(folder: Path, gloss: float = 0.0, room: bool = False, gains: np.ndarray | None = None) -> Scene:
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for i in range(VIEWS):
+        pose = _pose(2 * np.pi * i / VIEWS, 0.5 + 0.9 * (i % 3))
+        picture = _picture(pose, gloss, room) * (1.0 if gains is None else gains[i])
+        cv2.imwrite(str(folder / f"{i:03}.png"), np.rint(np.clip(picture, 0, 1)[..., ::-1] * 65535).astype(np.uint16))
+        frames.append({"file_path": f"{i:03}.png", "transform_matrix": pose.tolist()})
+    intrinsics = {"w": SIZE, "h": SIZE, "fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE / 2, "cy": SIZE / 2}
+    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+    return load_scene(folder)
+
+
+def _fitted(scene: Scene, steps: int = 260, **recipe: object) -> Trainer:
+    trainer = Trainer(scene, Recipe.model_validate({**SMALL, **recipe}), steps, None, 0, "cpu")
+    while trainer.progress < 1:
+        trainer.run_step()
+    return trainer
+
+
+def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> None:
+    trainer = _fitted(_scene(tmp_path / "s"))
+    assert not trainer.needs.design.background and trainer.field.surface.grid.extent == 1.0
+    assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.evidence
+    assert trainer.gains() == {}, trainer.needs.evidence
+    assert trainer.needs.scarce == ()
+    assert trainer.field.shader.heads.out_features == 3  # no tensor head
+    assert trainer.needs.evidence["tensor_head"].startswith("off")
+    assert trainer.report().psnr["rgb"] > 25  # the decisions are about a fit that works
+
+
+def test_a_glossy_ball_in_a_painted_room_gets_what_it_needs(tmp_path: Path) -> None:
+    trainer = _fitted(_scene(tmp_path / "s", gloss=0.5, room=True))
+    assert trainer.needs.design.background and trainer.field.surface.grid.extent == 2.0
+    assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.evidence
+    assert trainer.gains() == {}, trainer.needs.evidence
+
+
+def test_frames_of_different_exposure_get_gains_and_the_gains_are_right(tmp_path: Path) -> None:
+    gains = np.exp(0.25 * np.sin(1.7 * np.arange(VIEWS)))
+    scene = _scene(tmp_path / "s", gains=gains)
+    trainer = _fitted(scene, decide_at=0.3, learning_rate_exposure=5e-3)
+    found = np.array(trainer.gains()["rgb"])
+    true = np.array([gains[f.view] for f in scene.frames_of("rgb", scene.split.train)])
+    true /= np.exp(np.log(true).mean())
+    error = np.sqrt(np.square(np.log(found / true)).mean())
+    assert error < 0.4 * np.sqrt(np.square(np.log(true)).mean()), (found, true)
+    forced = _fitted(scene, steps=40, exposure="off")
+    assert forced.gains() == {} and "asked for by the recipe" in forced.needs.evidence["exposure"]
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_the_recipe_can_force_the_degree_of_view_dependence(tmp_path: Path, degree: int) -> None:
+    trainer = _fitted(_scene(tmp_path / "s"), steps=20, view_dependence=degree)
+    assert trainer.field.view_dependence == {"rgb": degree}
+    assert "asked for by the recipe" in trainer.needs.evidence["view_dependence.rgb"]
+
+
+def _needs(scene: Scene, **recipe: object) -> Needs:
+    return assess(scene, load_measurements(scene), Recipe.model_validate({**SMALL, **recipe}), 0, 1e6)
+
+
+def test_a_modality_with_few_frames_is_scarce() -> None:
+    from mmsynth.data import data_folder
+
+    scene = load_scene(data_folder("example_scene"))
+    assert _needs(scene).scarce == ()
+    few = _needs(keep_frames(scene, {"pol": 2}))
+    assert few.scarce == ("pol",) and 0 < few.share["pol"] < 0.5 and few.share["rgb"] == 1.0
+    assert _needs(keep_frames(scene, {"pol": 2}), scarce_below=0.0).scarce == ()
+
+
+def test_a_scarce_modality_leaves_geometry_and_appearance_alone() -> None:
+    from mmsynth.data import data_folder
+
+    scene = keep_frames(load_scene(data_folder("example_scene"), ["rgb", "pol"]), {"rgb": 1})
+    trainer = Trainer(scene, Recipe.model_validate({**SMALL, "eikonal": 0.0}), 10, None, 0, "cpu")
+    assert trainer.needs.scarce == ("rgb",)
+    weights = trainer.field.shader.heads.weight
+    before = weights.detach().clone()
+    tables = {n: p.detach().clone() for n, p in trainer.field.named_parameters() if n.endswith(".table")}
+    # without the plentiful modality nothing may move but the scarce one's own colours
+    trainer.measurements.pop("pol")
+    trainer.needs.share.pop("pol")
+    trainer.run_step()
+    for name, p in trainer.field.named_parameters():
+        if name in tables:
+            assert bool((p == tables[name]).all()), name
+    rows = trainer.field.shader.columns
+    assert bool((weights[rows["rgb"]] != before[rows["rgb"]]).any())
+    assert bool((weights[rows["pol"]] == before[rows["pol"]]).all())

@@ -1,0 +1,73 @@
+"""The tests that residuals are put to, on residuals that are known."""
+
+import numpy as np
+import pytest
+import torch
+
+from mmsynth.field.radiance import Shader
+from mmsynth.fitting import losses
+from mmsynth.fitting.measurements import Batch
+from mmsynth.fitting.probe import DEGREES, Residuals, degree_needed, errors_by_degree, exposure_spread
+from mmsynth.scene.scene import Sensor
+
+
+def _frames(gains: np.ndarray, noise: float, per_frame: int = 400) -> Residuals:
+    random = np.random.default_rng(0)
+    frame = np.repeat(np.arange(len(gains)), per_frame)
+    predicted = random.uniform(0.3, 1.5, len(frame))
+    return Residuals(predicted, gains[frame] * predicted + noise * random.normal(size=len(frame)), frame)
+
+
+@pytest.mark.parametrize("spread", [0.03, 0.1, 0.3])
+def test_spread_of_exposure_is_found(spread: float) -> None:
+    gains = np.exp(spread * np.random.default_rng(1).normal(size=200))
+    found, error = exposure_spread(_frames(gains, noise=0.1), 200)
+    assert found == pytest.approx(spread, rel=0.2)
+    assert 0.003 < error < 0.01  # 0.1 of noise over 400 numbers of about 1
+
+
+def test_noise_alone_is_no_exposure() -> None:
+    found, error = exposure_spread(_frames(np.ones(200), noise=0.3), 200)
+    assert found < error
+    assert exposure_spread(_frames(np.ones(1), noise=0.1), 1) == (0.0, 0.0)
+
+
+def test_one_odd_frame_is_no_exposure() -> None:
+    gains = np.ones(40)
+    gains[7] = 3.0
+    found, _ = exposure_spread(_frames(gains, noise=0.02), 40)
+    assert found < 0.01
+
+
+@pytest.mark.parametrize("needed", [0, 1, 3])
+def test_the_degree_that_light_has_is_found(needed: int) -> None:
+    """One grey modality whose light is a harmonic of the direction, and a shader that was taught it with all directions."""
+    torch.manual_seed(0)
+    rays = 4096
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=1)
+    x, y, _ = directions.unbind(1)
+    light = 1.0 + 0.5 * {0: 0 * x, 1: x, 3: x * (x * x - 3 * y * y)}[needed] + 0.05 * torch.randn(rays)
+    shader = Shader(2, 32, {"grey": Sensor("grey", ("L",), (550.0,))}, {"grey": 1.0})
+    ones = torch.ones(rays)
+    every = torch.arange(rays)
+    batch = Batch(
+        origins=torch.zeros(rays, 3), directions=directions, target=light, ray=every, output=torch.zeros(rays, dtype=torch.int64),
+        axes=torch.empty(0, 3), level=ones, saturation=9 * ones, weight=ones / rays, frame=0 * every,
+        parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"),
+    )  # fmt: skip
+    teacher = torch.optim.Adam(shader.parameters(), lr=8e-3)
+    for _ in range(150):
+        teacher.zero_grad()
+        losses.photometric(losses.predict(shader(torch.zeros(rays, 2), directions, DEGREES), ones, batch) - light, batch).backward()
+        teacher.step()
+    before = [p.detach().clone() for p in shader.parameters()]
+    errors = errors_by_degree(shader, torch.zeros(rays, 2), ones, batch)["grey"]
+    assert len(errors) == DEGREES + 1
+    assert degree_needed(errors, worth=0.1) == needed, errors
+    assert all(bool((p == q).all()) for p, q in zip(shader.parameters(), before, strict=True))  # copies learned, not the shader
+
+
+def test_degree_needed_is_the_lowest_of_the_good_ones() -> None:
+    assert degree_needed([1.05, 1.02, 1.0, 1.01], worth=0.1) == 0
+    assert degree_needed([2.0, 1.05, 1.0, 1.01], worth=0.1) == 1
+    assert degree_needed([2.0, 1.9, 1.5, 1.0], worth=0.1) == 3
