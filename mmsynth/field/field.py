@@ -27,6 +27,8 @@ from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import analyser_axes
 
+_WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
+
 
 @dataclass(frozen=True)
 class Rendering:
@@ -38,7 +40,7 @@ class Rendering:
         stokes: per polarization modality (H, W, 3): S0, S1, S2 in this camera's x-axis frame.
         depth_z, depth_ray: (H, W) float32 along the optical axis, along the ray; scene unit, NaN = no hit.
         normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit.
-        opacity: (H, W) float32 in [0, 1].
+        opacity: (H, W) float32 in [0, 1], of the region of interest; 0 where the surface met lies outside it.
         valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
     """
 
@@ -139,7 +141,10 @@ class Field(nn.Module):
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
         outputs = {d: self.shader(hits.features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
         opacity = hits.opacity[:, None]
-        out = {"opacity": hits.opacity.clamp(0.0, 1.0)}
+        # a background is opaque, too, but what lies there is not the object
+        reached = torch.linalg.vector_norm(origins + directions * hits.depth[:, None], dim=-1)
+        within = torch.isnan(hits.depth) | (reached <= _WITHIN)
+        out = {"opacity": torch.where(within, hits.opacity, torch.zeros_like(hits.opacity)).clamp(0.0, 1.0)}
         for name in modalities:
             angles = self.sensors[name].polarizer_angles_deg
             if angles is None:
@@ -273,7 +278,8 @@ class Field(nn.Module):
         except (OSError, SafetensorError, RuntimeError) as error:
             raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
         field.manifest = manifest
-        kernels.announce_compilation()  # a run may have been fitted on another machine
+        if device == "cpu":
+            kernels.announce_compilation()  # a run may have been fitted on another machine
         return field.to(device)
 
 

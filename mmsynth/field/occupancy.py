@@ -1,7 +1,8 @@
-"""Where to sample: a grid over [-1, 1]³ whose cells are outside, shell (a surface may be there) or solid.
+"""Where to sample: a grid over [-extent, extent]³ whose cells are shell (a surface may be there), solid, or outside.
 
-The signed distance is a certificate: a cell whose centre is farther from the surface than its half diagonal holds none.
-The margin 7/s covers the soft surface: what is lost beyond it is an opacity of e⁻⁷ = 9e-4.
+The signed distance is a certificate: a cell whose centre is farther from the surface than its half diagonal holds none, and an
+outside cell says, too, how far around it there is none. The margin 5/s covers the soft surface: what is lost beyond it is an
+opacity of e⁻⁵ = 7e-3.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from mmsynth.field.encoding import HashGrid
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.surface import Surface
 
-NEAR = 0.02  # radii from a camera at which rays begin when all of space is seen, or half-way to the region of interest
+NEAR = 0.02  # radii from a camera at which rays begin when all of space is seen, or most of the way to the region of interest
 HORIZON = 1e3  # where rays end that nothing stops, in radii
 
 
@@ -77,7 +77,7 @@ def trace(
     """
     if surface.grid.extent > 1.0:
         # a surface right before a camera explains its picture and no other: there is none
-        near = (0.5 * (torch.linalg.vector_norm(origins.detach(), dim=-1) - 1.0)).clamp(min=NEAR)
+        near = (0.8 * (torch.linalg.vector_norm(origins.detach(), dim=-1) - 1.0)).clamp(min=NEAR)
         far = torch.full_like(jitter, HORIZON)
     else:
         near, far = ball_interval(origins.detach(), directions.detach())

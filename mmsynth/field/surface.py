@@ -28,10 +28,8 @@ class Surface(nn.Module):
         self.spheres = np.array(spheres, np.float32)
 
     def forward(self, positions: Tensor, active: int) -> Tensor:
-        """Signed distance, positive outside: (N, 3) -> (N,)."""
-        if kernels.on_cpu(positions):
-            return kernels.cpu.surface_value(self, positions, active)
-        return self.reference(positions, active)
+        """Signed distance, positive outside: (N, 3) → (N,)."""
+        return kernels.surface_value(self, positions, active)
 
     def reference(self, positions: Tensor, active: int) -> Tensor:
         ones = torch.ones_like(positions[:, :1])

@@ -26,8 +26,8 @@ class Recipe(BaseModel):
     radiance_cells: float = Field(4.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
     surface_hidden: int = Field(32, ge=4, le=256, multiple_of=4)
     radiance_hidden: int = Field(64, ge=4, le=256)
-    occupancy_resolution: int = Field(64, ge=8, le=256)
-    occupancy_every: int = Field(16, ge=1, description="steps between updates of the occupancy grid")
+    occupancy_resolution: int = Field(96, ge=8, le=256)
+    occupancy_every: int = Field(32, ge=1, description="steps between updates of the occupancy grid")
     initial_radius: float | None = Field(None, gt=0, lt=1, description="of the sphere a fit starts from; none: chosen by the scene")
     horizon: float | None = Field(
         None, gt=1, lt=2, description="contracted radius of the sphere around everything that a fit starts from; none: by the cameras"
@@ -56,7 +56,7 @@ class Recipe(BaseModel):
     learning_rate_grid: float = Field(2e-2, gt=0)
     learning_rate_network: float = Field(8e-3, gt=0)
     learning_rate_end: float = Field(0.1, gt=0, le=1, description="factor at the end")
-    eikonal: float = Field(0.03, ge=0)
+    eikonal: float = Field(0.1, ge=0)
     eikonal_points: int = Field(1024, ge=8)
     emptiness: float = Field(0.02, ge=0, description="weight of opacity on black pixels of a black-background scene")
     opacity: float = Field(0.5, ge=0, description="weight of opacity against alpha, where images have it")

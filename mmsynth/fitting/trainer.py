@@ -375,7 +375,8 @@ def fit(
         steps, budget = planned.get("steps") or None, planned.get("budget") or None
         if steps is None and budget is None:
             budget = 60.0
-    kernels.announce_compilation()
+    if device == "cpu":
+        kernels.announce_compilation()
     trainer = Trainer(scene, recipe or load_recipe(None), steps, budget, seed, device)
     log: list[str] = []
     if saved is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize, softplus
 
-from mmsynth.field import kernels
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.radiance import Shader, intensity, radiance
 from mmsynth.scene.scene import Region, Sensor
@@ -29,7 +30,7 @@ def _field(background: bool, region: Region | None = None) -> Field:
         surface_levels=2, radiance_levels=2, surface_rows_log2=12, radiance_rows_log2=10, surface_finest=128, radiance_finest=12,
         background=background, horizon=1.9, surface_hidden=8, radiance_hidden=8, coarsest=5, occupancy=16,
     )  # fmt: skip
-    field = Field(design, SENSORS, LEVELS, region or Region((0.0, 0.0, 0.0), 1.0))
+    field = Field(design, dict(SENSORS), LEVELS, region or Region((0.0, 0.0, 0.0), 1.0))
     with torch.no_grad():
         field.surface.last.normal_(0, 0.05)
         field.appearance.table.normal_()
@@ -75,12 +76,13 @@ def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
 
 @pytest.mark.parametrize("background", [False, True])
 def test_what_rays_see_is_the_shader_of_their_features(background: bool) -> None:
-    from mmsynth.field import rendering
-
     field = _field(background)
     origins, directions, out = _look_around(field, 200)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((200,), 0.5), field.sampling)
-    assert torch.equal(out["opacity"], hits.opacity.clamp(0, 1)) and torch.equal(out["depth"].nan_to_num(), hits.depth.nan_to_num())
+    # opacity is the region's: a background is as opaque, and not what was looked for
+    outside = (origins + directions * hits.depth[:, None]).norm(dim=1) > 1.001
+    assert torch.equal(out["opacity"][~outside], hits.opacity[~outside].clamp(0, 1)) and not out["opacity"][outside].any()
+    assert bool(outside.any()) == background and torch.equal(out["depth"].nan_to_num(), hits.depth.nan_to_num())
     nothing = hits.opacity == 0
     assert nothing.any() or background
     for name in SENSORS:
@@ -91,6 +93,43 @@ def test_what_rays_see_is_the_shader_of_their_features(background: bool) -> None
     for found, expected in ((s0, i0 + i90), (s0, i45 + i135), (s1, i0 - i90), (s2, i45 - i135)):
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
     assert (torch.hypot(s1, s2) <= s0 * (1 + 1e-5)).all()
+
+
+def test_a_degree_hides_the_direction_beyond_it() -> None:
+    torch.manual_seed(0)
+    shader = Shader(4, 8, SENSORS, LEVELS)
+    features, directions = torch.randn(1, 4).expand(30, 4), normalize(torch.randn(30, 3), dim=1)
+    none, linear, all_of_them = (shader(features, directions, degree) for degree in (0, 1, 3))
+    torch.testing.assert_close(none, none[:1].expand(30, -1))
+    assert linear.std(0).min() > 1e-4 and not torch.allclose(linear, all_of_them)
+    degrees = torch.tensor([0, 1, 3]).repeat(10)
+    expected = torch.stack([none, linear, all_of_them])[torch.tensor([0, 1, 2]).repeat(10), torch.arange(30)]
+    torch.testing.assert_close(shader(features, directions, degrees), expected)
+
+
+def test_every_modality_has_the_view_dependence_that_it_needs() -> None:
+    field = _field(False)
+    field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
+    origins, directions, out = _look_around(field, 100)
+    hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((100,), 0.5), field.sampling)
+    for name, degree in (("rgb", 0), ("nir", 3)):
+        expected = hits.opacity[:, None] * field.shader.values(name, field.shader(hits.features, directions, degree))
+        torch.testing.assert_close(out[name], expected.detach(), atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> None:
+    field = _field(background, Region((1.0, 2.0, 3.0), 0.5))
+    field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
+    field.occupancy.states[3, 4, 5] = 17
+    field.sensors["nir"] = replace(NIR, saturation=float("inf"), mosaic=np.array([[0]]))
+    field.save(tmp_path)
+    again = Field.load(tmp_path)
+    assert (again.design, again.region, again.sampling, again.levels) == (field.design, field.region, field.sampling, field.levels)
+    assert again.view_dependence == field.view_dependence and again.sensors["nir"].saturation == float("inf")
+    assert int(again.occupancy.states[3, 4, 5]) == 17 and again.surface.grid.extent == field.surface.grid.extent
+    a, b = _look_around(field, 50)[2], _look_around(again, 50)[2]
+    assert all(torch.equal(a[name].nan_to_num(), b[name].nan_to_num()) for name in a)
 
 
 def test_modalities_have_their_own_outputs() -> None:

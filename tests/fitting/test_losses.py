@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ring
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mmsynth.fitting.losses import eikonal, photometric, predict, residual
@@ -208,6 +208,7 @@ def test_saturated_targets_only_pull_upwards() -> None:
     assert residual(torch.tensor([9.0]), _alone([7.0], float("inf"), 1.0)).tolist() == [2.0]
 
 
+@settings(deadline=None)
 @given(st.floats(1e-4, 1e3))
 def test_dark_modalities_weigh_as_much_as_bright_ones(level: float) -> None:
     relative = torch.linspace(-2, 2, 9)

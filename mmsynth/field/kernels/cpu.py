@@ -105,18 +105,19 @@ class _Value(torch.autograd.Function):
         store, surface, count = ctx.store, ctx.surface, len(gradient)
         chunks = -(-count // POINTS)
         extent, grid = np.float32(surface.grid.extent), _grid(surface.grid)
-        positions = torch.empty(count if ctx.needs_input_grad[1] else 0, 3)
         weight_out, last_out = store.take("weight_out last_out")
         weight_out = weight_out.reshape(len(weight_out), *weight.shape)
-        cpu_rays.surface_backward(
-            _array(gradient), extent, surface.spheres, *grid, ctx.active, _array(weight), _array(last),
-            *store.take("block hidden row"), weight_out, last_out, ctx.needs_input_grad[1], positions.numpy(),
-        )  # fmt: skip
+        g, w = _array(gradient), _array(weight)
+        cpu_rays.surface_backward(g, ctx.active, w, _array(last), *store.take("block hidden row"), weight_out, last_out)
+        positions = None
+        if ctx.needs_input_grad[1]:
+            positions = torch.empty(count, 3)
+            cpu_rays.surface_positions(g, extent, surface.spheres, *grid, ctx.active, w, *store.take("block hidden"), positions.numpy())
         if surface.grid.table.requires_grad:
             cpu_rays.surface_scatter(count, extent, *grid[1:], ctx.active, *store.take("block"), _table_gradient(surface.grid.table))
         ctx.store = None
         weights = torch.from_numpy(weight_out[:chunks].sum(0)), torch.from_numpy(last_out[:chunks].sum(0))
-        return None, positions if ctx.needs_input_grad[1] else None, None, None, *weights
+        return None, positions, None, None, *weights
 
 
 class _Trace(torch.autograd.Function):

@@ -31,7 +31,7 @@ from mmsynth.field.kernels.cpu_blocks import (
     surface_block_positions,
 )
 
-CHUNK = 128  # rays
+CHUNK = 256  # rays
 LANES = 64
 POINTS = 128  # positions of a block when there are no rays
 MOST = 96  # samples of one ray
@@ -67,10 +67,9 @@ def surface_forward(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def surface_backward(  # type: ignore[no-untyped-def]
-    gradient, extent, spheres, table, resolutions, offsets, active, weight, last, block, hidden, row, weight_out, last_out,
-    wanted, positions_out,
+    gradient, active, weight, last, block, hidden, row, weight_out, last_out
 ):  # fmt: skip
-    """Gradients of the weights per chunk; feature rows become gradients; gradients of the positions (N, 3) when ``wanted``."""
+    """Gradients of the weights per chunk; hidden and feature rows become gradients."""
     count = gradient.shape[0]
     for chunk in prange((count + POINTS - 1) // POINTS):
         begin = np.int64(chunk) * POINTS
@@ -79,18 +78,30 @@ def surface_backward(  # type: ignore[no-untyped-def]
         last_out[chunk] = np.float32(0.0)
         g = gradient[begin : begin + n]
         surface_block_backward(block[chunk], hidden[chunk], g, n, active, weight, last, row[chunk], weight_out[chunk], last_out[chunk])
-        if wanted:
-            out = np.empty(3 * n, np.float32)
-            surface_block_positions(block[chunk], hidden[chunk], g, n, extent, spheres, table, resolutions, offsets, active, weight, out)
-            for i in range(n):
-                for a in range(3):
-                    positions_out[begin + i, a] = out[a * n + i]
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def surface_positions(  # type: ignore[no-untyped-def]
+    gradient, extent, spheres, table, resolutions, offsets, active, weight, block, hidden, positions_out
+):
+    """After ``surface_backward``: gradients of the positions (N, 3)."""
+    count = gradient.shape[0]
+    for chunk in prange((count + POINTS - 1) // POINTS):
+        begin = np.int64(chunk) * POINTS
+        n = min(POINTS, count - begin)
+        g = gradient[begin : begin + n]
+        out = np.empty(3 * n, np.float32)
+        surface_block_positions(block[chunk], hidden[chunk], g, n, extent, spheres, table, resolutions, offsets, active, weight, out)
+        for i in range(n):
+            for a in range(3):
+                positions_out[begin + i, a] = out[a * n + i]
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def surface_scatter(count, extent, resolutions, offsets, active, block, gradient):  # type: ignore[no-untyped-def]
     """The table's gradient, one task per level."""
-    for level in prange(active):
+    for task in prange(active):
+        level = np.int64(task)  # unsigned otherwise, and the block would be compiled twice
         for chunk in range((count + POINTS - 1) // POINTS):
             n = min(POINTS, count - chunk * POINTS)
             scatter_block(block[chunk], n, extent, gradient, resolutions, offsets, level, FIRST)
@@ -201,7 +212,7 @@ def trace_forward(  # type: ignore[no-untyped-def]
         used = 0
         n_blocks = 0
         while going > 0 or waiting < count:
-            n = 0
+            n = np.int64(0)
             f = block[slot, used * size :]
             taken = 0
             while n < LANES and (taken < going or waiting < count):
@@ -268,11 +279,11 @@ def trace_forward(  # type: ignore[no-untyped-def]
                 going += 1
             sizes[slot, n_blocks] = n
             n_blocks += 1
-            used += n
+            used += int(n)
         rounds[slot, 0] = n_blocks
         samples[chunk] = used
         # sections that matter, in the order of the rays
-        sections = 0
+        sections = np.int64(0)  # as a literal, blocks would be compiled for it, too
         for i in range(count):
             o = begin + i
             tau_sum = 0.0
@@ -387,12 +398,12 @@ def trace_backward(  # type: ignore[no-untyped-def]
                     tau_sum += tau
         used = 0
         for b in range(rounds[chunk, 0]):
-            n = sizes[chunk, b]
+            n = np.int64(sizes[chunk, b])
             surface_block_backward(
                 block[chunk, used * size :], hidden[chunk, used * units :], sdf[chunk, used : used + n], n,
                 active, weight, last, row[chunk], weight_out[chunk], last_out[chunk],
             )  # fmt: skip
-            used += n
+            used += int(n)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -403,17 +414,18 @@ def trace_scatter(  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
     size = block.shape[1] // (CHUNK * MOST)
     chunks = (rays + CHUNK - 1) // CHUNK
-    for task in prange(active + a_active):
+    for each in prange(active + a_active):
+        task = np.int64(each)
         if task < active:
             for chunk in range(chunks):
                 used = 0
                 for b in range(rounds[chunk, 0]):
-                    n = sizes[chunk, b]
+                    n = np.int64(sizes[chunk, b])
                     scatter_block(block[chunk, used * size :], n, extent, gradient, resolutions, offsets, task, FIRST)
-                    used += n
+                    used += int(n)
         else:
             for chunk in range(chunks):
-                scatter_block(s_block[chunk], s_count[chunk, 0], extent, a_gradient, a_resolutions, a_offsets, task - active, 3)
+                scatter_block(s_block[chunk], np.int64(s_count[chunk, 0]), extent, a_gradient, a_resolutions, a_offsets, task - active, 3)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -448,7 +460,7 @@ def trace_rays_backward(  # type: ignore[no-untyped-def]
         out = np.zeros(3 * max(np.int64(LANES), np.int64(sections)), np.float32)
         for b in range(rounds[chunk, 0] + 1):
             last = b == rounds[chunk, 0]
-            n = sections if last else sizes[chunk, b]
+            n = np.int64(sections if last else sizes[chunk, b])
             if last:
                 out[: 3 * n] = np.float32(0.0)
                 position_block(s_block[chunk], n, extent, a_table, a_resolutions, a_offsets, a_active, 3, out)
@@ -471,4 +483,4 @@ def trace_rays_backward(  # type: ignore[no-untyped-def]
                 directions_out[o, 1] += t * gy
                 directions_out[o, 2] += t * gz
             if not last:
-                used += n
+                used += int(n)
