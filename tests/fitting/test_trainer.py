@@ -123,7 +123,11 @@ def test_a_fit_with_a_background_learns_too(tmp_path: Path) -> None:
     seen = field.render(frame.camera, frame.camera_to_world)
     expected = picture(frame.camera, frame.camera_to_world)
     assert np.square(seen.channels["rgb"] - expected).mean() < 0.25 * expected.var()
-    assert (seen.opacity > 0.5).mean() > 0.95  # every ray ends somewhere
+    assert np.isfinite(seen.depth_ray).mean() > 0.95  # every ray ends somewhere
+    d = ray_map(frame.camera)[0] @ frame.camera_to_world[:3, :3].T
+    b = d @ frame.camera_to_world[:3, 3]
+    ball = b**2 - frame.camera_to_world[:3, 3] @ frame.camera_to_world[:3, 3] + 0.5**2 > 0
+    assert ((seen.opacity > 0.5) == ball).mean() > 0.9  # and opacity is that of the region, not of the sky
     ball = expected[..., 0] == expected[..., 1]
     assert 2.4 < np.median(seen.depth_ray[ball]) < 3.2
 
