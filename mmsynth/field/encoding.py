@@ -39,6 +39,10 @@ class HashGrid(nn.Module):
         """Cell size of the finest active level."""
         return 2.0 * self.extent / float(self.resolutions[min(active, len(self.resolutions)) - 1])
 
+    def place(self, points: Tensor) -> Tensor:
+        """Points of the normalised frame in the grid's own: contracted space where it is wider than the region."""
+        return kernels.contract(points) if self.extent > 1.0 else points
+
     def forward(self, positions: Tensor, active: int) -> Tensor:
         """(N, 3) → (N, width); levels from ``active`` on are zero and cost nothing."""
         unit = (positions * (0.5 / self.extent) + 0.5).clamp(0.0, 1.0)

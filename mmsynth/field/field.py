@@ -120,15 +120,11 @@ class Field(nn.Module):
         unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
 
-    def _contracted(self, points: Tensor) -> Tensor:
-        """Normalised points to the frame of the grids."""
-        return kernels.contract(points) if self.surface.grid.extent > 1.0 else points
-
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
         """Signed distance in the scene's unit, positive outside: (N, 3) → (N,) float32. Of contracted space, where it is."""
         parts = self.to_normalised(points).split(65536)
-        values = [self.surface(self._contracted(part), self.sampling.active_surface) for part in parts]
+        values = [self.surface(self.surface.grid.place(part), self.sampling.active_surface) for part in parts]
         return torch.cat(values).cpu().numpy() * np.float32(self.region.radius) if values else np.empty(0, np.float32)
 
     @torch.no_grad()
@@ -162,7 +158,7 @@ class Field(nn.Module):
             normal = torch.full_like(directions, float("nan"))
             epsilon = self.surface.grid.cell(self.sampling.active_surface)
             points = origins[hit] + directions[hit] * depth[hit, None]
-            slope = self.surface.gradient(self._contracted(points), epsilon, self.sampling.active_surface)
+            slope = self.surface.gradient(self.surface.grid.place(points), epsilon, self.sampling.active_surface)
             if self.surface.grid.extent > 1.0:
                 slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)

@@ -16,7 +16,8 @@ from mmsynth.field.encoding import HashGrid
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.surface import Surface
 
-NEAR = 0.02  # radii from a camera at which rays begin when all of space is seen, or most of the way to the region of interest
+NEAR = 0.02  # radii from a camera at which rays begin at the least, when all of space is seen
+_FREE = 0.8  # of the way from a camera to the region of interest, where rays begin then
 HORIZON = 1e3  # where rays end that nothing stops, in radii
 
 
@@ -77,7 +78,7 @@ def trace(
     """
     if surface.grid.extent > 1.0:
         # a surface right before a camera explains its picture and no other: there is none
-        near = (0.8 * (torch.linalg.vector_norm(origins.detach(), dim=-1) - 1.0)).clamp(min=NEAR)
+        near = (_FREE * (torch.linalg.vector_norm(origins.detach(), dim=-1) - 1.0)).clamp(min=NEAR)
         far = torch.full_like(jitter, HORIZON)
     else:
         near, far = ball_interval(origins.detach(), directions.detach())
@@ -92,7 +93,6 @@ def trace_by_parts(
 ) -> Hits:  # fmt: skip
     """``trace`` from single operations, with autograd, on any device and in any precision; near, far: (R,)."""
     rays = len(origins)
-    contracted = surface.grid.extent > 1.0
     with torch.no_grad():
         t, ray, offsets = kernels.march(
             lambda x: surface(x, sampling.active_surface), origins, directions, near, far, jitter, occupancy.states,
@@ -100,18 +100,16 @@ def trace_by_parts(
         )  # fmt: skip
 
     def place(ray: Tensor, t: Tensor) -> Tensor:
-        points = origins[ray] + directions[ray] * t[:, None]
-        return kernels.contract(points) if contracted else points
+        return surface.grid.place(origins[ray] + directions[ray] * t[:, None])
 
     sdf = surface(place(ray, t), sampling.active_surface)
     weights, crossing = kernels.section_weights(sdf, sampling.sharpness, offsets)
     with torch.no_grad():
         # what is left of a ray that was ended goes to its last section
         before = kernels.exclusive_sum(weights, offsets, ray)
-        ended = before + weights > -torch.expm1(torch.tensor(-sampling.opaque))
-        rest = torch.where(ended, 1.0 - before - weights, torch.zeros_like(weights))
-        first = ended & ~(before > -torch.expm1(torch.tensor(-sampling.opaque)))
-        rest = torch.where(first, rest, torch.zeros_like(rest))
+        enough = -torch.expm1(torch.tensor(-sampling.opaque))
+        ends = (before + weights > enough) & ~(before > enough)
+        rest = torch.where(ends, 1.0 - before - weights, torch.zeros_like(weights))
     weights = weights + rest
     opacity = torch.zeros_like(jitter).index_add(0, ray, weights)
     chosen = torch.nonzero(weights.detach() > sampling.significant)[:, 0]

@@ -14,7 +14,11 @@ _TAPS = ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, 1.0, 1.0
 
 
 class Surface(nn.Module):
-    """sdf(x) = |x| - r0 + network(hash grid(x), x), with a zero last layer: exactly a sphere at step 0, no warm-up fit."""
+    """sdf(x) = min(|x| - r₀, r₁ - |x|) + network(hash grid(x), x), with a zero last layer: exact spheres at step 0, no warm-up fit.
+
+    Args:
+        spheres: r₀ of the ball in the middle, r₁ of the horizon around everything, in the grid's frame.
+    """
 
     def __init__(self, grid: HashGrid, hidden: int, spheres: tuple[float, float]) -> None:
         super().__init__()
@@ -32,6 +36,7 @@ class Surface(nn.Module):
         return kernels.surface_value(self, positions, active)
 
     def reference(self, positions: Tensor, active: int) -> Tensor:
+        """``forward`` in torch, with autograd, on any device and in any precision."""
         ones = torch.ones_like(positions[:, :1])
         hidden = torch.relu(torch.cat([positions, ones, self.grid(positions, active)], -1) @ self.hidden.T)
         norm = torch.linalg.vector_norm(positions, dim=-1)

@@ -127,6 +127,11 @@ class Measurements:
         return out
 
 
+def in_order(measurements: dict[str, Measurements]) -> list[str]:
+    """The modalities as batches hold them: polarization last."""
+    return sorted(measurements, key=lambda n: measurements[n].sensor.is_polarization)
+
+
 def draw(
     measurements: dict[str, Measurements],
     columns: dict[str, slice],
@@ -139,7 +144,7 @@ def draw(
     Args:
         columns: the shader outputs of each modality. rays: how many of each modality.
     """
-    order = sorted(measurements, key=lambda n: measurements[n].sensor.is_polarization)
+    order = in_order(measurements)
     parts: dict[str, tuple[slice, slice]] = {}
     lists: dict[str, list[np.ndarray]] = {k: [] for k in ("origins", "directions", "target", "ray", "output", "axes", "frame", "alpha")}
     numbers = []

@@ -22,7 +22,7 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     design = needs.design
     return Sampling(
         sharpness=sharpness,
-        # three steps across the soft surface (its width is about 3.5 / s); never coarser than a twentieth of the radius
+        # at the default, two steps across the soft surface (its width is about 3.5 / s); never coarser than a tenth of the radius
         step=min(0.1, recipe.step_width / sharpness),
         stride=recipe.stride,
         grazing=recipe.grazing,

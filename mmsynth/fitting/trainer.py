@@ -25,7 +25,7 @@ from mmsynth.field.field import Field
 from mmsynth.files import write_text
 from mmsynth.fitting import losses, probe
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
-from mmsynth.fitting.measurements import Batch, Measurements, draw, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.optimiser import Adam
 from mmsynth.fitting.recipe import Recipe, load_recipe
@@ -162,7 +162,7 @@ class Trainer:
         outputs = field.shader.heads(hidden)
         predicted = losses.predict(outputs, opacity, batch)
         if self.state.decided and self.state.decided["exposure"]:
-            predicted = predicted * torch.exp(self.log_gain - self.log_gain.mean())[batch.frame]
+            predicted = predicted * self._gain()[batch.frame]
         difference = losses.residual(predicted, batch)
         loss = losses.photometric(difference, batch)
         squared = difference.detach().square()
@@ -176,6 +176,10 @@ class Trainer:
         if recipe.eikonal > 0:
             loss = loss + recipe.eikonal * losses.eikonal(self._gradients(hits, origins, directions, sampling, generator))
         return loss, errors, int(hits.samples)
+
+    def _gain(self) -> torch.Tensor:
+        """Exposure of every frame relative to their mean."""
+        return torch.exp(self.log_gain - self.log_gain.mean())
 
     def _degrees(self, batch: Batch) -> torch.Tensor:
         degrees = torch.empty(len(batch.origins), dtype=torch.int64)
@@ -210,10 +214,9 @@ class Trainer:
             spread, noise = probe.exposure_spread(probe.Residuals(rows[0], rows[1], rows[2] - begin), frames)
             begin += frames
             spreads[name] = spread if spread > 2 * noise / math.sqrt(max(frames, 1)) else 0.0
-        exposure = max(spreads.values()) > recipe.exposure_worth
         why = ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
         asked = recipe.exposure != "auto"
-        exposure = recipe.exposure == "on" if asked else exposure
+        exposure = recipe.exposure == "on" if asked else max(spreads.values()) > recipe.exposure_worth
         evidence["exposure"] = (
             f"{'on' if exposure else 'off'}: {'asked for by the recipe; ' if asked else ''}exposure differs between frames by {why}"
         )
@@ -237,7 +240,7 @@ class Trainer:
             chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
             noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
             at = origins[chosen] + directions[chosen] * hits.depth[chosen, None]
-            points.append((kernels.contract(at) if extent > 1 else at) + noise)
+            points.append(self.field.surface.grid.place(at) + noise)
         epsilon = self.field.surface.grid.cell(sampling.active_surface)
         return self.field.surface.gradient(torch.cat(points), epsilon, sampling.active_surface)
 
@@ -251,9 +254,8 @@ class Trainer:
         """Exposure of each training frame relative to the mean, per modality; empty when no gains were needed."""
         if not self.state.decided or not self.state.decided["exposure"]:
             return {}
-        gains = torch.exp(self.log_gain - self.log_gain.mean()).detach().cpu()
-        order = sorted(self.measurements, key=lambda n: self.measurements[n].sensor.is_polarization)
-        parts = gains.split([len(self.measurements[n].origins) for n in order])
+        order = in_order(self.measurements)
+        parts = self._gain().detach().cpu().split([len(self.measurements[n].origins) for n in order])
         return {n: part.tolist() for n, part in zip(order, parts, strict=True)}
 
     def report(self) -> Progress:
