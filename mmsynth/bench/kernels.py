@@ -27,9 +27,13 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import cpu, cuda, reference
 from mmsynth.field.occupancy import Occupancy
+from mmsynth.field.radiance import Shader
 from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
+from mmsynth.fitting import losses
+from mmsynth.fitting.measurements import Batch
 from mmsynth.operations.progress import Progress
+from mmsynth.scene.scene import Sensor
 
 REPEATS = 9
 _PER_RAY = 8
@@ -149,6 +153,36 @@ def _trace_by_parts(x: Inputs) -> Outputs:
     return torch.cat([hits.features, hits.opacity[:, None]], 1), hits.samples
 
 
+def _compare_inputs(samples: int) -> Inputs:
+    """Rays of which each has one number: a channel of a colour mosaic, and for the last half an intensity behind an analyser."""
+    g, tensors = _generator(), samples // 2
+    sensors = {
+        "rgb": Sensor("rgb", ("R", "G", "B"), (None,) * 3),
+        "pol": Sensor("pol", ("0", "45", "90", "135"), (None,) * 4, None, (0.0, 45.0, 90.0, 135.0)),
+    }
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        shader = Shader(_field()["appearance"].width, 64, sensors, {"rgb": 1.0, "pol": 1.0})
+    output = torch.cat([torch.randint(3, (samples - tensors,), generator=g), torch.full((tensors,), 3)])
+    unit = lambda count: nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    values = {name: torch.rand(samples, generator=g) for name in ("opacity", "target")}
+    constants = {name: torch.full((samples,), value) for name, value in (("level", 1.0), ("saturation", 0.9), ("weight", 1 / samples))}
+    return {
+        "shader": shader, "features": torch.randn(samples, _field()["appearance"].width, generator=g), "directions": unit(samples),
+        "degrees": torch.full((samples,), 3), "teaches": torch.ones(samples, dtype=torch.bool), "ray": torch.arange(samples),
+        "output": output, "axes": unit(tensors), **values, **constants,
+    }  # fmt: skip
+
+
+def _compare(compare: Callable[..., Outputs]) -> Callable[[Inputs], Outputs]:
+    def call(x: Inputs) -> Outputs:
+        names = "directions", "target", "ray", "output", "axes", "level", "saturation", "weight"
+        batch = Batch(**{n: x[n] for n in names}, origins=x["directions"], frame=x["ray"], parts={}, alpha=x["opacity"])
+        return compare(x["shader"], x["features"], x["opacity"], batch, x["degrees"], x["teaches"])
+
+    return call
+
+
 def _adam_inputs(samples: int) -> Inputs:
     g = _generator()
     parameter, gradient, first, second = torch.randn(4, samples, generator=g)
@@ -222,6 +256,13 @@ OPERATIONS: tuple[Operation, ...] = (
         {"torch": _trace_by_parts, "numba": _trace, "triton": _trace},
         leaves=lambda x: [*x["surface"].parameters(), x["appearance"].table],
         count=lambda output: int(output[1]),
+    ),
+    Operation(
+        "compare",
+        _compare_inputs,
+        {"torch": _compare(losses.compare_by_parts), "numba": _compare(losses.compare), "torch cuda": _compare(losses.compare_by_parts)},
+        leaves=lambda x: [*x["shader"].parameters(), x["features"], x["opacity"]],
+        count=lambda output: len(output[1]),
     ),
     Operation(
         "adam",

@@ -5,8 +5,40 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mmsynth.field.radiance import intensity, radiance
+from mmsynth.field import kernels
+from mmsynth.field.radiance import Shader, intensity, radiance
 from mmsynth.fitting.measurements import Batch
+
+
+def compare(
+    shader: Shader, features: Tensor, opacity: Tensor, batch: Batch, degrees: Tensor, teaches: Tensor, gain: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Shade rays and compare them with what was measured.
+
+    Args:
+        features: (R, F). opacity: (R,). degrees: (R,) int64 of the harmonics of direction that are seen.
+        teaches: (R,) bool; rays that do not pass gradients on to the heads alone, not to features, opacity and trunk.
+        gain: (M,) factors of the numbers, none: 1.
+    Returns:
+        The photometric loss, a scalar, and the squared residual of every number, (M,), without a gradient.
+    """
+    if kernels.on_cpu(features):
+        rays = batch.directions, degrees, teaches
+        numbers = batch.target, batch.ray, batch.output, batch.axes, batch.level, batch.saturation, batch.weight
+        return kernels.cpu.compare(shader, features, opacity, rays, numbers, gain)
+    return compare_by_parts(shader, features, opacity, batch, degrees, teaches, gain)
+
+
+def compare_by_parts(
+    shader: Shader, features: Tensor, opacity: Tensor, batch: Batch, degrees: Tensor, teaches: Tensor, gain: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """``compare`` from single operations, with autograd, on any device and in any precision."""
+    hidden = shader.hidden(features, batch.directions, degrees)
+    hidden = torch.where(teaches[:, None], hidden, hidden.detach())
+    opacity = torch.where(teaches, opacity, opacity.detach())
+    predicted = predict(shader.heads(hidden), opacity, batch)
+    difference = residual(predicted if gain is None else predicted * gain, batch)
+    return photometric(difference, batch), difference.detach().square()
 
 
 def predict(outputs: Tensor, opacity: Tensor, batch: Batch) -> Tensor:

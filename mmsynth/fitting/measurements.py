@@ -24,8 +24,8 @@ class Batch:
 
     Attributes:
         origins, directions: (R, 3).
-        target: (M,) raw values. ray: (M,) int64. output: (M,) int64, the shader output that predicts the number; the first of
-            six for a polarization.
+        target: (M,) raw values. ray: (M,) int64, never decreasing. output: (M,) int64, the shader output that predicts the number;
+            the first of six for a polarization.
         axes: (P, 3) analyser axes of the last P numbers.
         level, saturation, weight: (M,) the modality's typical value, where it clips, and the share in a mean over modalities.
         frame: (M,) int64, counted through the modalities in the order of ``parts``.

@@ -154,18 +154,11 @@ class Trainer:
         origins, directions = batch.origins, batch.directions
         jitter = torch.rand(len(origins), generator=generator).to(self.device)
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
-        hidden, opacity = field.shader.hidden(hits.features, directions, self._degrees(batch)), hits.opacity
-        for name in self.needs.scarce:
-            # a few frames would bend geometry, appearance and trunk to themselves: they teach their own head alone
-            rays = batch.parts[name][0]
-            hidden, opacity = _detached(hidden, rays), _detached(opacity, rays)
-        outputs = field.shader.heads(hidden)
-        predicted = losses.predict(outputs, opacity, batch)
-        if self.state.decided and self.state.decided["exposure"]:
-            predicted = predicted * self._gain()[batch.frame]
-        difference = losses.residual(predicted, batch)
-        loss = losses.photometric(difference, batch)
-        squared = difference.detach().square()
+        degrees = self._per_ray(batch, field.view_dependence)
+        # a few frames would bend geometry, appearance and trunk to themselves: scarce modalities teach their own head alone
+        teaches = self._per_ray(batch, {n: n not in self.needs.scarce for n in batch.parts})
+        gain = self._gain()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
+        loss, squared = losses.compare(field.shader, hits.features, hits.opacity, batch, degrees, teaches, gain)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_alpha:
             known = torch.isfinite(batch.alpha)
@@ -181,11 +174,10 @@ class Trainer:
         """Exposure of every frame relative to their mean."""
         return torch.exp(self.log_gain - self.log_gain.mean())
 
-    def _degrees(self, batch: Batch) -> torch.Tensor:
-        degrees = torch.empty(len(batch.origins), dtype=torch.int64)
-        for name, (rays, _) in batch.parts.items():
-            degrees[rays] = self.field.view_dependence[name]
-        return degrees.to(self.device)
+    def _per_ray(self, batch: Batch, values: dict[str, Any]) -> torch.Tensor:
+        """A value for each modality → one for each ray, (R,)."""
+        counts = [rays.stop - rays.start for rays, _ in batch.parts.values()]
+        return torch.from_numpy(np.repeat([values[n] for n in batch.parts], counts)).to(self.device)
 
     @torch.no_grad()
     def _decide(self, sampling: rendering.Sampling) -> None:
@@ -195,7 +187,8 @@ class Trainer:
         batch = draw(self.measurements, field.shader.columns, dict.fromkeys(self.measurements, PROBE_RAYS), random, self.device)
         jitter = torch.full((len(batch.origins),), 0.5, device=self.device)
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-        predicted = losses.predict(field.shader(hits.features, batch.directions, self._degrees(batch)), hits.opacity, batch)
+        outputs = field.shader(hits.features, batch.directions, self._per_ray(batch, field.view_dependence))
+        predicted = losses.predict(outputs, hits.opacity, batch)
         evidence = self.needs.evidence
         degrees, spreads, begin = {}, {}, 0
         usable = batch.target < batch.saturation
@@ -314,11 +307,6 @@ class Trainer:
             "steps": self.steps or 0,
             "budget": self.budget or 0.0,
         }
-
-
-def _detached(values: torch.Tensor, rows: slice) -> torch.Tensor:
-    """The same values; the given rows pass no gradient on."""
-    return torch.cat([values[: rows.start], values[rows].detach(), values[rows.stop :]])
 
 
 def pick_device(name: str) -> str:

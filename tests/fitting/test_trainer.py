@@ -320,13 +320,14 @@ def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str) -
 
 def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    photometric = losses.photometric
+    compare = losses.compare
 
-    def sometimes(difference: torch.Tensor, batch: Any) -> torch.Tensor:
+    def sometimes(*args: Any) -> tuple[torch.Tensor, torch.Tensor]:
         calls.append(1)
-        return photometric(difference, batch) * (torch.nan if len(calls) in (1, 4) else 1.0)
+        loss, squared = compare(*args)
+        return loss * (torch.nan if len(calls) in (1, 4) else 1.0), squared
 
-    monkeypatch.setattr(losses, "photometric", sometimes)
+    monkeypatch.setattr(losses, "compare", sometimes)
     news: list[trainer_module.Progress] = []
     field = fit(scene, tmp_path, SMALL, steps=6, on_step=news.append)
     assert field.manifest["skipped_steps"] == 2 and field.manifest["steps"] == 6

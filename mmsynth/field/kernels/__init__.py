@@ -104,8 +104,10 @@ def announce_compilation() -> None:
     """Compile the CPU kernels of a fit if they never were, and say so, or load them: a tiny fit, so that no timed loop does it."""
     from mmsynth.field.encoding import HashGrid  # the field is made of these kernels
     from mmsynth.field.occupancy import Occupancy
+    from mmsynth.field.radiance import Shader
     from mmsynth.field.rendering import Sampling, trace
     from mmsynth.field.surface import Surface
+    from mmsynth.scene.scene import Sensor
 
     if not cpu.is_compiled():
         print("compiling kernels once, ~17 s ...", file=sys.stderr, flush=True)
@@ -113,7 +115,11 @@ def announce_compilation() -> None:
         surface, appearance = Surface(HashGrid(1, 8, 4, 4), 4, (0.5, 4.0)), HashGrid(1, 8, 4, 4)
         origins, directions = torch.tensor([[0.0, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])
         hits = trace(surface, appearance, Occupancy(4), origins, directions, torch.zeros(1), Sampling(20.0, 0.1, 1, 1))
-        (hits.features.sum() + hits.opacity.sum() + surface(origins, 1).sum()).backward()
+        shader = Shader(4, 4, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0})
+        one, index = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+        rays, numbers = (directions, index, index == 0), (one, index, index, torch.empty(0, 3), one, one, one)
+        loss, _ = cpu.compare(shader, hits.features, hits.opacity, rays, numbers, None)
+        (loss + surface(origins, 1).sum()).backward()
     table = surface.grid.table
     assert table.grad is not None
     adam(table, table.grad, torch.zeros_like(table), torch.zeros_like(table), 1e-3, 0.9, 0.99, 1e-15, 1)

@@ -16,12 +16,13 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from mmsynth.field.kernels import cpu_rays
+from mmsynth.field.kernels import cpu_rays, cpu_shading
 from mmsynth.field.kernels.cpu_blocks import FEATURES
 from mmsynth.field.kernels.cpu_rays import CHUNK, MOST, POINTS
 
 if TYPE_CHECKING:
     from mmsynth.field.encoding import HashGrid
+    from mmsynth.field.radiance import Shader
     from mmsynth.field.rendering import Sampling
     from mmsynth.field.surface import Surface
 
@@ -38,6 +39,7 @@ class _Store:
                 self.key, self.arrays = key, _pool.pop(index)[1]
                 return
         slots = 1 << max(slots - 1, 3).bit_length()
+        _pool[:] = [(other, arrays) for other, arrays in _pool if other != key]  # too few slots, and needs grow
         self.key, self.arrays = key, {name: np.empty((slots, size), dtype) for name, (dtype, size) in sizes.items()}
 
     def take(self, names: str) -> list[np.ndarray]:
@@ -64,6 +66,16 @@ def _ray_stores(weight: Tensor, appearance_levels: int) -> dict[str, tuple[type,
         **samples, **rays, **sections, "rounds": (i, 1), "sizes": (i, most), "s_ray": (i, most), "s_k": (i, most), "s_count": (i, 1),
         **_network(weight),
     }  # fmt: skip
+
+
+def _shading_stores(weights: tuple[Tensor, ...]) -> dict[str, tuple[type, int]]:
+    hidden, inputs = weights[0].shape
+    rows, columns = (-(-n // cpu_shading.WIDE) * cpu_shading.WIDE for n in (hidden, inputs))
+    block = rows * cpu_shading.CHUNK
+    scratch = {"x": columns * cpu_shading.CHUNK, "h1": block, "h2": block, "g1": block, "g2": block}
+    sums = {"first_out": rows * columns, "first_bias_out": rows, "second_out": rows * rows, "second_bias_out": rows}
+    heads = {"heads_out": weights[4].numel(), "heads_bias_out": len(weights[4])}
+    return {name: (np.float32, size) for name, size in {**scratch, **sums, **heads}.items()}
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -179,6 +191,40 @@ class _Trace(torch.autograd.Function):
         return None, *rays, *[None] * 7, *weights
 
 
+class _Compare(torch.autograd.Function):
+    """The gradients of a number are known when it is: the forward pass takes them all, the backward pass only scales them."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, learn: bool, rays: tuple[Tensor, ...], numbers: tuple[Tensor, ...], features: Tensor, opacity: Tensor, gain: Tensor,
+        *weights: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        chunks = -(-len(features) // cpu_shading.CHUNK)
+        store = _Store(max(chunks, get_num_threads()), _shading_stores(weights))
+        scratch = [x.reshape(len(x), cpu_shading.CHUNK, -1) for x in store.take("x h1 h2 g1 g2")]
+        sums = store.take("first_out first_bias_out second_out second_bias_out heads_out heads_bias_out")
+        for i in (0, 2, 4):
+            sums[i] = sums[i].reshape(len(sums[i]), sums[i + 1].shape[1], -1)
+        loss, squared = np.zeros(chunks), torch.empty(len(numbers[0]))
+        gradients = [torch.empty(x.shape) for x in (features, opacity, gain)]
+        cpu_shading.compare(
+            *(_array(x) for x in (features, opacity, *rays, *numbers, gain, *weights)), learn, *scratch,
+            loss, squared.numpy(), *(g.numpy() for g in gradients), *sums,
+        )  # fmt: skip
+        if learn:
+            for total, weight in zip(sums, weights, strict=True):
+                whole = total[:chunks].sum(0)
+                gradients.append(torch.from_numpy(whole[tuple(slice(n) for n in weight.shape)]))
+            ctx.gradients = gradients
+        ctx.mark_non_differentiable(squared)
+        return torch.tensor(loss.sum(), dtype=torch.float32), squared
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, None, *(gradient * g for g in ctx.gradients)
+
+
 def _kept(*tensors: Tensor) -> bool:
     """Whether a backward pass may follow; within ``forward`` autograd does not tell."""
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
@@ -199,6 +245,19 @@ def trace(
     sampling = replace(sampling, active_surface=active[0], active_radiance=active[1])
     keep = _kept(origins, directions, surface.hidden)
     return _Trace.apply(keep, origins, directions, near, far, jitter, states, sampling, surface, appearance, surface.hidden, surface.last)
+
+
+def compare(
+    shader: Shader, features: Tensor, opacity: Tensor, rays: tuple[Tensor, ...], numbers: tuple[Tensor, ...], gain: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """See ``losses.compare``; float32. Differentiable in features, opacity, gain and the shader's weights.
+
+    Args:
+        rays: directions, degrees, teaches. numbers: target, ray (which never decreases), output, axes, level, saturation, weight.
+    """
+    weights = tuple(shader.parameters())  # and biases: of the two layers of the trunk, of the heads
+    gain = features.new_empty(0) if gain is None else gain
+    return _Compare.apply(_kept(features, opacity, gain, *weights), rays, numbers, features, opacity, gain, *weights)
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
@@ -234,7 +293,7 @@ def adam(
 
 _KERNELS = (
     cpu_rays.surface_forward, cpu_rays.surface_backward, cpu_rays.surface_scatter, cpu_rays.trace_forward, cpu_rays.trace_backward,
-    cpu_rays.trace_scatter, _adam,
+    cpu_rays.trace_scatter, cpu_shading.compare, _adam,
 )  # fmt: skip
 
 

@@ -29,10 +29,11 @@ def _row(context, builder, table_type, table, row):  # type: ignore[no-untyped-d
     return builder.bitcast(builder.gep(data, [offset]), _VECTOR.as_pointer())
 
 
-def _splat(builder, value):  # type: ignore[no-untyped-def]
-    undefined = ir.Constant(_VECTOR, ir.Undefined)
+def splat(builder, value, vector):  # type: ignore[no-untyped-def]
+    """A vector of this type, full of one number."""
+    undefined = ir.Constant(vector, ir.Undefined)
     first = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_I32, FEATURES), [0] * FEATURES))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_I32, vector.count), [0] * vector.count))
 
 
 @intrinsic
@@ -43,7 +44,7 @@ def _mix(typingctx, table, rows, weights):  # type: ignore[no-untyped-def]
         total = None
         for k in range(8):
             row = _row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k))
-            weight = _splat(builder, builder.extract_value(args[2], k))
+            weight = splat(builder, builder.extract_value(args[2], k), _VECTOR)
             part = builder.fmul(builder.load(row, align=4), weight, flags=("fast",))
             total = part if total is None else builder.fadd(total, part, flags=("fast",))
         numbers = [builder.extract_element(total, ir.Constant(_I32, k)) for k in range(FEATURES)]
@@ -62,7 +63,7 @@ def _spread(typingctx, table, rows, weights, gradient):  # type: ignore[no-untyp
             vector = builder.insert_element(vector, builder.extract_value(args[3], k), ir.Constant(_I32, k))
         for k in range(8):
             row = _row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k))
-            part = builder.fmul(vector, _splat(builder, builder.extract_value(args[2], k)), flags=("fast",))
+            part = builder.fmul(vector, splat(builder, builder.extract_value(args[2], k), _VECTOR), flags=("fast",))
             builder.store(builder.fadd(builder.load(row, align=4), part, flags=("fast",)), row, align=4)
         return context.get_dummy_value()
 
