@@ -90,6 +90,7 @@ class Trainer:
         rates = {n: recipe.learning_rate_grid if n in tables else recipe.learning_rate_network for n in parameters}
         rates[_GAINS] = recipe.learning_rate_exposure
         self.optimiser = Adam(parameters, rates)
+        self.networks = [p for n, p in parameters.items() if n not in tables]
         self.state = _State(rays=recipe.rays_at_start)
         self.has_alpha = any(m.has_alpha for m in self.measurements.values())
         self.mean_loss = math.nan
@@ -131,8 +132,8 @@ class Trainer:
             self._skip("the loss is not finite")
             return
         loss.backward()
-        networks = [p.grad for n, p in field.named_parameters() if not n.endswith(".table") and p.grad is not None]
-        if not bool(torch.isfinite(torch.cat([g.flatten() for g in networks]).sum())):  # what is NaN in a sample is NaN in a sum
+        # what is NaN in a sample is NaN in a sum
+        if not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
             self.optimiser.clear()
             self._skip("a gradient is not finite")
             return

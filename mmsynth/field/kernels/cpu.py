@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mmsynth.field.rendering import Sampling
     from mmsynth.field.surface import Surface
 
+PART = 16384  # parameters that Adam takes at a time
 _pool: list[tuple[tuple[int, ...], dict[str, np.ndarray]]] = []
 
 
@@ -276,9 +277,9 @@ def _adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[n
 def _adam(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
     """``rate`` includes the first bias correction, ``root`` is one over the square root of the second."""
     count = p.shape[0]
-    for chunk in prange((count + 16383) // 16384):
-        begin = np.int64(chunk) * 16384
-        end = min(count, begin + 16384)
+    for chunk in prange((count + PART - 1) // PART):
+        begin = np.int64(chunk) * PART
+        end = min(count, begin + PART)
         _adam_part(p[begin:end], g[begin:end], m[begin:end], v[begin:end], rate, beta1, beta2, root, epsilon)
 
 
@@ -288,12 +289,13 @@ def adam(
     """See ``reference.adam``; float32."""
     arrays = (x.detach().view(-1).numpy() for x in (parameter, gradient, first, second))
     f = np.float32
-    _adam(*arrays, f(rate / (1 - beta1**count)), f(beta1), f(beta2), f(1 / math.sqrt(1 - beta2**count)), f(epsilon))  # type: ignore[call-arg]
+    step = _adam if parameter.numel() > PART else _adam_part  # to wake the other threads would take longer than the work
+    step(*arrays, f(rate / (1 - beta1**count)), f(beta1), f(beta2), f(1 / math.sqrt(1 - beta2**count)), f(epsilon))  # type: ignore[call-arg]
 
 
 _KERNELS = (
     cpu_rays.surface_forward, cpu_rays.surface_backward, cpu_rays.surface_scatter, cpu_rays.trace_forward, cpu_rays.trace_backward,
-    cpu_rays.trace_scatter, cpu_shading.compare, _adam,
+    cpu_rays.trace_scatter, cpu_shading.compare, _adam, _adam_part,
 )  # fmt: skip
 
 
