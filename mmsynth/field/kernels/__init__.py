@@ -110,7 +110,7 @@ def announce_compilation() -> None:
     from mmsynth.scene.scene import Sensor
 
     if not cpu.is_compiled():
-        print("compiling kernels once, ~17 s ...", file=sys.stderr, flush=True)
+        print("compiling kernels once, ~25 s ...", file=sys.stderr, flush=True)
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
         surface, appearance = Surface(HashGrid(1, 8, 4, 4), 4, (0.5, 4.0)), HashGrid(1, 8, 4, 4)
         origins, directions = torch.tensor([[0.0, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])
