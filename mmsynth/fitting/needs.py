@@ -17,6 +17,9 @@ from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.scene.scene import Scene
 
+_FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
+_COARSE = 128  # cells across the grid that a surface may have however few the measurements: small pictures show large things
+
 
 @dataclass(frozen=True)
 class Needs:
@@ -69,11 +72,15 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black"
     # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
     extent = 2 if background else 1  # contracted space is twice as wide
-    surface_finest = int(np.clip(extent * recipe.surface_cells / footprint, 32, 1024))
+    finest = extent * recipe.surface_cells / footprint
+    # geometry that few measurements see bends to each of them; appearance may, it is only looked at from where they were taken
+    seen_enough = max(_COARSE, math.sqrt(min(pixels, rays_to_come) / (_FACES * recipe.measurements_per_cell)))
+    surface_finest = int(np.clip(min(finest, seen_enough), 32, 1024))
     radiance_finest = int(np.clip(extent * recipe.radiance_cells / footprint, 64, 2048))
     cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
     seen = f", {coarser:.1f} pixels apart for {rays_to_come:.1e} rays on {pixels:.1e} pixels" if coarser > 1 else ""
-    evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}"
+    few = f", the surface's for {recipe.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
+    evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}{few}"
     # measured: a large sphere fills hollows between objects, and stays there painted
     radius = recipe.initial_radius or (0.4 if background else 0.15)
     farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in measurements.values())
@@ -102,7 +109,8 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         initial_radius=radius,
     )
     black = not background and outside >= 0.005
-    return Needs(design, footprint, max(recipe.sharpness_end / footprint, 2 * recipe.sharpness_start), black, scarce, share, evidence)
+    sharpness = recipe.sharpness_end * min(1.0, seen_enough / finest) / footprint
+    return Needs(design, footprint, max(sharpness, 2 * recipe.sharpness_start), black, scarce, share, evidence)
 
 
 def _shares(measurements: dict[str, Measurements], below: float) -> dict[str, float]:
@@ -113,8 +121,8 @@ def _shares(measurements: dict[str, Measurements], below: float) -> dict[str, fl
 
 
 def _rows_log2(finest: int, most: int) -> int:
-    """Rows for the cells that a surface can occupy: about six faces' worth of the finest level, at most 2^most."""
-    return min(most, math.ceil(math.log2(6 * finest**2)))
+    """Rows for the cells that a surface can occupy: about the faces of a cube at the finest level, at most 2^most."""
+    return min(most, math.ceil(math.log2(_FACES * finest**2)))
 
 
 def _footprint(measurements: dict[str, Measurements]) -> float:

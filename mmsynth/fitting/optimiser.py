@@ -22,12 +22,13 @@ class Adam:
         self.count = 0
 
     @torch.no_grad()
-    def step(self, factor: float) -> None:
-        """One step with all rates times ``factor``."""
+    def step(self, factor: float, slower: dict[str, float] | None = None) -> None:
+        """One step with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too."""
         self.count += 1
         for name, p in self.parameters.items():
             if p.grad is not None:
-                kernels.adam(p, p.grad, *self.moments[name], self.rates[name] * factor, *_BETAS, _EPSILON, self.count)
+                rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
+                kernels.adam(p, p.grad, *self.moments[name], rate, *_BETAS, _EPSILON, self.count)
 
     def clear(self) -> None:
         """Drop the gradients without a step."""

@@ -24,6 +24,9 @@ class Recipe(BaseModel):
     radiance_rows_log2: int = Field(17, ge=8, le=22)
     surface_cells: float = Field(2.0, gt=0, description="finest surface grid: cells per two pixel footprints")
     radiance_cells: float = Field(4.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
+    measurements_per_cell: float = Field(
+        10.0, gt=0, description="rays that must see a cell of the finest surface grid, on the average; fewer: coarser and softer"
+    )
     surface_hidden: int = Field(32, ge=4, le=256, multiple_of=4)
     radiance_hidden: int = Field(64, ge=4, le=256)
     occupancy_resolution: int = Field(96, ge=8, le=256)
@@ -55,10 +58,11 @@ class Recipe(BaseModel):
     learning_rate_exposure: float = Field(1e-3, gt=0)
     learning_rate_grid: float = Field(2e-2, gt=0)
     learning_rate_network: float = Field(8e-3, gt=0)
+    learning_rate_sharpness: float = Field(200.0, gt=0, description="sharpness beyond which the surface's rates fall in proportion")
     learning_rate_end: float = Field(0.1, gt=0, le=1, description="factor at the end")
     eikonal: float = Field(0.1, ge=0)
     eikonal_points: int = Field(1024, ge=8)
-    emptiness: float = Field(0.02, ge=0, description="weight of opacity on black pixels of a black-background scene")
+    emptiness: float = Field(1.0, ge=0, description="weight of opacity on black pixels of a black-background scene")
     opacity: float = Field(0.5, ge=0, description="weight of opacity against alpha, where images have it")
 
 

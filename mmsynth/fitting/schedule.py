@@ -33,6 +33,15 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     )
 
 
+def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
+    """Beyond some sharpness the surface's rates fall in proportion to the width of the soft surface.
+
+    A step of Adam moves the surface by about its rate, whatever the gradient. Where that is a good part of the soft surface,
+    the surface never comes to rest: colours blur, and views stop to agree.
+    """
+    return min(1.0, recipe.learning_rate_sharpness / sharpness)
+
+
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:
     """A short linear rise, then level, then exponential decay over the last two thirds."""
     rise = min(1.0, progress / 0.01)

@@ -29,7 +29,7 @@ from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, lo
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.optimiser import Adam
 from mmsynth.fitting.recipe import Recipe, load_recipe
-from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
+from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
 from mmsynth.scene.scene import Scene
 
 CHECKPOINT_SECONDS = 60.0
@@ -91,6 +91,7 @@ class Trainer:
         rates[_GAINS] = recipe.learning_rate_exposure
         self.optimiser = Adam(parameters, rates)
         self.networks = [p for n, p in parameters.items() if n not in tables]
+        self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.state = _State(rays=recipe.rays_at_start)
         self.has_alpha = any(m.has_alpha for m in self.measurements.values())
         self.mean_loss = math.nan
@@ -137,7 +138,8 @@ class Trainer:
             self.optimiser.clear()
             self._skip("a gradient is not finite")
             return
-        self.optimiser.step(learning_rate_factor(self.progress, recipe))
+        slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, recipe))
+        self.optimiser.step(learning_rate_factor(self.progress, recipe), slower)
         keep = 0.98 if state.step else 0.0
         first = math.isnan(self.mean_loss)  # also after steps that were skipped
         self.mean_loss = float(loss.detach()) if first else keep * self.mean_loss + (1 - keep) * float(loss.detach())

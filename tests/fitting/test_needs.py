@@ -142,3 +142,20 @@ def test_a_scarce_modality_leaves_geometry_and_appearance_alone() -> None:
     rows = trainer.field.shader.columns
     assert bool((weights[rows["rgb"]] != before[rows["rgb"]]).any())
     assert bool((weights[rows["pol"]] == before[rows["pol"]]).all())
+
+
+def test_a_cell_of_the_surface_is_seen_by_enough_measurements(tmp_path: Path) -> None:
+    scene = _scene(tmp_path / "plain")
+    measurements = load_measurements(scene)
+    pixels = sum(int(m.ends[-1]) for m in measurements.values())
+    fine = {"surface_cells": 64.0}  # finer than pixels, so that only the measurements limit it
+    enough, few = (assess(scene, measurements, Recipe(measurements_per_cell=m, **fine), 0, 1e9) for m in (1e-3, 1e-2))
+    free = assess(scene, measurements, Recipe(measurements_per_cell=1e-9, **fine), 0, 1e9)
+    assert 6 * few.design.surface_finest**2 * 1e-2 == pytest.approx(pixels, rel=0.02)
+    assert 6 * enough.design.surface_finest**2 * 1e-3 >= pixels or enough.design.surface_finest == 1024
+    # what is coarser is softer, in proportion
+    wanted = free.sharpness_end * few.design.surface_finest / (2 if free.design.background else 1) / fine["surface_cells"] * few.footprint
+    assert few.sharpness_end == pytest.approx(wanted, rel=0.02)
+    assert "measurements of each" in few.evidence["resolution"] and "measurements of each" not in free.evidence["resolution"]
+    # small pictures show large things: down to a grid of 128 cells, not below
+    assert assess(scene, measurements, Recipe(measurements_per_cell=1e6, **fine), 0, 1e9).design.surface_finest == 128

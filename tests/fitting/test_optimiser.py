@@ -38,7 +38,8 @@ def test_parameters_have_rates_of_their_own(dtype: torch.dtype, tolerance: float
             p.grad = ours[name].grad.to(torch.float64, copy=True)
         for group, rate in zip(other.param_groups, (0.02, 0.005), strict=True):
             group["lr"] = rate * factor
-        mine.step(factor)
+        other.param_groups[1]["lr"] *= 0.3
+        mine.step(factor, {"b": 0.3})
         other.step()
         assert not any(p.grad.any() for p in ours.values())
     for name, p in ours.items():

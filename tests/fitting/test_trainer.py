@@ -40,6 +40,7 @@ SMALL = Recipe.model_validate({
     "occupancy_resolution": 24, "occupancy_every": 16, "initial_radius": 0.3, "horizon": 1.8, "sharpness_start": 20.0,
     "sharpness_end": 4.0, "sharpness_until": 0.6, "step_width": 2.0, "stride": 0.7, "grazing": 0.5, "significant": 0.01, "opaque": 3.0,
     "levels_until": 0.4, "view_dependence_from": 0.3, "decide_at": 0.6, "view_dependence": 2, "exposure": "off",
+    "measurements_per_cell": 1e-3, "learning_rate_sharpness": 200.0,
     "learning_rate_grid": 2e-2, "learning_rate_network": 8e-3, "learning_rate_end": 0.1, "eikonal": 0.05, "eikonal_points": 128,
     "emptiness": 0.02, "opacity": 0.5,
 })  # fmt: skip

@@ -1,0 +1,36 @@
+"""A surface many times sharper than a step of the optimiser is long must still come to rest."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.surface import Surface
+from mmsynth.fitting.optimiser import Adam
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.schedule import surface_rate_factor
+
+
+def _moved(sharpness: float) -> float:
+    """How far noise, which asks for nothing, makes the surface tremble late in a fit, in widths of the soft surface."""
+    torch.manual_seed(0)
+    recipe = Recipe()
+    surface = Surface(HashGrid(4, 12, 8, 64), 16, (0.5, 4.0))
+    torch.nn.init.normal_(surface.last, std=0.3)
+    parameters = dict(surface.named_parameters())
+    optimiser = Adam(parameters, {n: recipe.learning_rate_grid if n == "grid.table" else recipe.learning_rate_network for n in parameters})
+    slower = dict.fromkeys(parameters, surface_rate_factor(sharpness, recipe))
+    points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=-1) * 0.5
+    trembling = []
+    for _ in range(20):
+        before = surface(points, 4).detach()
+        (surface(points, 4) * torch.randn(len(points))).sum().backward()
+        optimiser.step(recipe.learning_rate_end, slower)
+        trembling.append(float((surface(points, 4).detach() - before).square().mean().sqrt()))
+    return sum(trembling) / len(trembling) * sharpness / 3.5
+
+
+@pytest.mark.parametrize("sharpness", [200.0, 800.0, 3200.0])
+def test_noise_moves_a_surface_by_less_than_a_tenth_of_its_softness_however_sharp(sharpness: float) -> None:
+    assert _moved(sharpness) < 0.1
