@@ -18,6 +18,7 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.scene.scene import Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
+_HORIZON = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
 _COARSE = 128  # cells across the grid that a surface may have however few the measurements: small pictures show large things
 
 
@@ -84,10 +85,11 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     # measured: a large sphere fills hollows between objects, and stays there painted
     radius = recipe.initial_radius or (0.4 if background else 0.15)
     farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in measurements.values())
-    horizon = recipe.horizon or 2.0 - 1.0 / (4.0 * max(farthest, 1.0))
-    evidence["initial_sphere"] = (
-        f"radius {radius:g}: {'asked for by the recipe' if recipe.initial_radius else 'background ' + ('on' if background else 'off')}"
-    )
+    # measured: what starts far behind the scene reaches it late, and in streaks
+    horizon = recipe.horizon or 2.0 - 1.0 / (_HORIZON * max(farthest, 1.0))
+    around = f", one around everything at {1 / (2 - horizon):.2g} radii" if background else ""
+    why = "asked for by the recipe" if recipe.initial_radius else f"background {'on' if background else 'off'}"
+    evidence["initial_sphere"] = f"radius {radius:g}: {why}{around}"
     share = _shares(measurements, recipe.scarce_below)
     scarce = tuple(n for n, s in share.items() if s < 1.0)
     frames = ", ".join(f"{n} {len(measurements[n].origins)} frames" for n in scarce)
