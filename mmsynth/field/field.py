@@ -64,6 +64,7 @@ class Design:
     radiance_rows_log2: int = 16
     radiance_finest: int = 256
     background: bool = False
+    beyond: bool = False
     horizon: float = 1.9
     surface_hidden: int = 32
     radiance_hidden: int = 64
@@ -108,6 +109,7 @@ class Field(nn.Module):
         )
         self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest, extent)
         self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, levels)
+        self.beyond = nn.Parameter(torch.zeros(self.appearance.width)) if d.beyond else None
         self.occupancy = Occupancy(d.occupancy, extent)
         self.sampling = Sampling(20.0, 0.05, d.surface_levels, d.radiance_levels)
 
@@ -119,6 +121,14 @@ class Field(nn.Module):
         """World points (..., 3) → normalised frame, float32 on the field's device."""
         unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
+
+    def to_shade(self, hits: rendering.Hits) -> tuple[Tensor, Tensor]:
+        """Features (R, F) and opacity (R,) of what is shaded. Light from beyond the region has features, too, and no place: only a
+        direction; where it is modelled, no ray ends in the dark."""
+        if self.beyond is None:
+            return hits.features, hits.opacity
+        passed = (1.0 - hits.opacity)[:, None]
+        return hits.opacity[:, None] * hits.features + passed * self.beyond, torch.ones_like(hits.opacity)
 
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
@@ -135,8 +145,9 @@ class Field(nn.Module):
         rays = len(origins)
         jitter = torch.full((rays,), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
-        outputs = {d: self.shader(hits.features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
-        opacity = hits.opacity[:, None]
+        features, opacity = self.to_shade(hits)
+        opacity = opacity[:, None]
+        outputs = {d: self.shader(features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
         # a background is opaque, too, but what lies there is not the object
         reached = torch.linalg.vector_norm(origins + directions * hits.depth[:, None], dim=-1)
         within = torch.isnan(hits.depth) | (reached <= _WITHIN)

@@ -55,7 +55,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     pixels = sum(int(m.ends[-1]) for m in measurements.values())
     coarser = max(1.0, math.sqrt(pixels / rays_to_come))
     footprint = _footprint(measurements) * coarser
-    outside, bright, rays = _look_outside(measurements, np.random.default_rng((seed, 7)))
+    outside, bright, light, rays = _look_outside(measurements, np.random.default_rng((seed, 7)))
     evidence = {}
     if recipe.background != "auto":
         background = recipe.background == "on"
@@ -71,6 +71,16 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         verdict = "on" if background else "off"
         past = f"{outside:.1%} of {rays} sampled pixels see past the region of interest"
         evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black"
+    dim = "nothing is seen past the region of interest" if outside < 0.005 else f"what is past it has {light:.1%} of the brightest light"
+    if background:
+        beyond, evidence["beyond"] = False, "off: the background is modelled"
+    elif recipe.beyond != "auto":
+        beyond, evidence["beyond"] = recipe.beyond == "on", f"{recipe.beyond}: asked for by the recipe"
+    elif scene.black_background or any(m.has_alpha for m in measurements.values()):
+        beyond, evidence["beyond"] = False, "off: the input says that it is black or transparent"
+    else:
+        beyond = outside >= 0.005 and light > 0.01
+        evidence["beyond"] = f"{'on' if beyond else 'off'}: {dim}"
     # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
     extent = 2 if background else 1  # contracted space is twice as wide
     finest = extent * recipe.surface_cells / footprint
@@ -104,6 +114,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         radiance_rows_log2=_rows_log2(radiance_finest, recipe.radiance_rows_log2),
         radiance_finest=radiance_finest,
         background=background,
+        beyond=beyond,
         horizon=horizon,
         surface_hidden=recipe.surface_hidden,
         radiance_hidden=recipe.radiance_hidden,
@@ -136,9 +147,10 @@ def _footprint(measurements: dict[str, Measurements]) -> float:
     return float(np.median(np.concatenate(sizes)))
 
 
-def _look_outside(measurements: dict[str, Measurements], random: np.random.Generator) -> tuple[float, float, int]:
-    """Share of pixels whose ray misses the region, share of these that are not black, number of pixels looked at."""
+def _look_outside(measurements: dict[str, Measurements], random: np.random.Generator) -> tuple[float, float, float, int]:
+    """Share of pixels whose ray misses the region; of these the share that is bright and the mean, relative to bright pixels; how many."""
     misses = bright = rays = 0
+    light = 0.0
     for m in measurements.values():
         frame, pixel = m.pick(4096, random)
         origins, directions = m.rays(frame, pixel)
@@ -147,6 +159,8 @@ def _look_outside(measurements: dict[str, Measurements], random: np.random.Gener
         values = m.read(frame, pixel)[0].mean(1)
         missing = closest > 1.0
         misses += int(missing.sum())
-        bright += int((values[missing] > 0.25 * np.quantile(values, 0.95)).sum())
+        high = max(float(np.quantile(values, 0.95)), 1e-12)
+        bright += int((values[missing] > 0.25 * high).sum())
+        light += float(values[missing].sum()) / high
         rays += len(frame)
-    return misses / rays, bright / max(misses, 1), rays
+    return misses / rays, bright / max(misses, 1), light / max(misses, 1), rays

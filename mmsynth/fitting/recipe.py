@@ -18,6 +18,9 @@ class Recipe(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     background: Literal["auto", "on", "off"] = Field("auto", description="model what is outside the region of interest")
+    beyond: Literal["auto", "on", "off"] = Field(
+        "auto", description="where the background is not modelled: what passes the region has a colour per direction, and is not black"
+    )
     surface_levels: int = Field(5, ge=1, le=16)
     surface_rows_log2: int = Field(16, ge=8, le=22)
     radiance_levels: int = Field(6, ge=1, le=16)

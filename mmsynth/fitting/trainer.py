@@ -161,7 +161,9 @@ class Trainer:
         # a few frames would bend geometry, appearance and trunk to themselves: scarce modalities teach their own head alone
         teaches = self._per_ray(batch, {n: n not in self.needs.scarce for n in batch.parts})
         gain = self._gain()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
-        loss, squared = losses.compare(field.shader, hits.features, hits.opacity, batch, degrees, teaches, gain)
+        # light from beyond the region would explain what is in it as long as that has no shape
+        shaded = field.to_shade(hits) if self.state.decided else (hits.features, hits.opacity)
+        loss, squared = losses.compare(field.shader, *shaded, batch, degrees, teaches, gain)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_alpha:
             known = torch.isfinite(batch.alpha)

@@ -7,10 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mmsynth.field.field import Field
 from mmsynth.fitting.measurements import load_measurements
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
+from mmsynth.scene.images import load_frame
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene, keep_frames
 
@@ -32,8 +35,8 @@ def _pose(angle: float, height: float) -> np.ndarray:
     return pose
 
 
-def _picture(pose: np.ndarray, gloss: float, room: bool) -> np.ndarray:
-    """A ball of radius 0.7 with bands of colour, a highlight of the given strength, and a painted room around it or none."""
+def _picture(pose: np.ndarray, gloss: float, room: float) -> np.ndarray:
+    """A ball of radius 0.7 with bands of colour, a highlight and a painted room of the given brightness."""
     v, u = np.mgrid[:SIZE, :SIZE]
     local = np.stack([(u - (SIZE - 1) / 2) / FOCAL, -(v - (SIZE - 1) / 2) / FOCAL, -np.ones_like(u, float)], -1)
     d = local @ pose[:3, :3].T
@@ -47,11 +50,10 @@ def _picture(pose: np.ndarray, gloss: float, room: bool) -> np.ndarray:
     light = np.array([0.5, 0.2, 0.84])
     mirrored = d - 2 * (d * n).sum(-1, keepdims=True) * n
     ball = bands + gloss * np.clip(mirrored @ light, 0, 1)[..., None] ** 3
-    behind = 0.35 + 0.2 * np.sin(5 * d) if room else np.zeros_like(ball)
-    return np.where(hit[..., None], ball, behind)
+    return np.where(hit[..., None], ball, room * (0.35 + 0.2 * np.sin(5 * d)))
 
 
-def _scene(folder: Path, gloss: float = 0.0, room: bool = False, gains: np.ndarray | None = None) -> Scene:
+def _scene(folder: Path, gloss: float = 0.0, room: float = 0.0, gains: np.ndarray | None = None) -> Scene:
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for i in range(VIEWS):
@@ -77,16 +79,42 @@ def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> 
     assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.evidence
     assert trainer.gains() == {}, trainer.needs.evidence
     assert trainer.needs.scarce == ()
+    assert trainer.field.beyond is None and trainer.needs.evidence["beyond"].startswith("off")
     assert trainer.field.shader.heads.out_features == 3  # no tensor head
     assert trainer.needs.evidence["tensor_head"].startswith("off")
     assert trainer.report().psnr["rgb"] > 25  # the decisions are about a fit that works
 
 
 def test_a_glossy_ball_in_a_painted_room_gets_what_it_needs(tmp_path: Path) -> None:
-    trainer = _fitted(_scene(tmp_path / "s", gloss=0.5, room=True))
+    trainer = _fitted(_scene(tmp_path / "s", gloss=0.5, room=1.0))
     assert trainer.needs.design.background and trainer.field.surface.grid.extent == 2.0
     assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.evidence
     assert trainer.gains() == {}, trainer.needs.evidence
+
+
+def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
+    """Mean absolute error of the test views where no ball is."""
+    errors = []
+    for frame in scene.frames_of("rgb", scene.split.test):
+        truth, _ = load_frame(scene.sensors["rgb"], frame)
+        seen = trainer.field.render(frame.camera, frame.camera_to_world)
+        assert np.isfinite(seen.channels["rgb"]).all()
+        errors.append(np.abs(seen.channels["rgb"] - truth)[seen.opacity < 0.1].mean())
+    return float(np.mean(errors))
+
+
+def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) -> None:
+    scene = _scene(tmp_path / "s", room=0.2)
+    trainer, without = _fitted(scene), _fitted(scene, beyond="off")
+    assert trainer.needs.design.beyond and not trainer.needs.design.background, trainer.needs.evidence
+    assert without.field.beyond is None and "asked for by the recipe" in without.needs.evidence["beyond"]
+    assert _past_the_ball(trainer, scene) < 0.5 * _past_the_ball(without, scene)
+    # and it is still known after it was stored
+    trainer.field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
+    trainer.field.save(tmp_path)
+    frame = scene.frames_of("rgb", scene.split.test)[0]
+    before, after = (f.render(frame.camera, frame.camera_to_world).channels["rgb"] for f in (trainer.field, Field.load(tmp_path)))
+    np.testing.assert_array_equal(before, after)
 
 
 def test_frames_of_different_exposure_get_gains_and_the_gains_are_right(tmp_path: Path) -> None:
