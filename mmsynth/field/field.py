@@ -84,6 +84,7 @@ class Field(nn.Module):
         rig: sensor → (4, 4) sensor_to_reference, scene unit; the reference is the first sensor.
         sampling: how finely it is rendered. manifest: everything known about the fit.
         view_dependence: degree of the spherical harmonics of each modality's radiance.
+        beyond: (F,) features of the light that passes the region, None where that is black or the background is modelled.
     """
 
     def __init__(
