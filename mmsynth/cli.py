@@ -190,13 +190,21 @@ def fit(
             psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
             show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
 
+        told: set[str] = set()
+
+        def explain(evidence: dict[str, str]) -> None:
+            for what, why in evidence.items():
+                if what not in told:
+                    say(f"needs {what}: {why}")
+            told.update(evidence)
+
         def on_start(needs: Needs) -> None:
-            for what, why in needs.evidence.items():
-                say(f"needs {what}: {why}")
+            explain(needs.evidence)
 
         field = fit_field(
             loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume, on_start=on_start, on_step=on_step
         )
+        explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
     write_report(folder, field, scene=loaded)
     mark_latest(folder)
     facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}

@@ -23,7 +23,7 @@ from mmsynth.field.radiance import Shader
 from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
 from mmsynth.files import read_json, write_atomic, write_json
-from mmsynth.scene.scene import Region, Sensor
+from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import analyser_axes
 
@@ -51,6 +51,18 @@ class Rendering:
     normal: np.ndarray
     opacity: np.ndarray
     valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Rigid motions by which a fit found the input's poses to be off; scene unit.
+
+    Attributes:
+        views: by view id, (4, 4), applied in the world frame. sensors: by name, (4, 4), applied in the camera's axes.
+    """
+
+    views: dict[int, np.ndarray]
+    sensors: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,7 @@ class Field(nn.Module):
         sampling: how finely it is rendered. manifest: everything known about the fit.
         view_dependence: degree of the spherical harmonics of each modality's radiance.
         beyond: (F,) features of the light that passes the region, None where that is black or the background is modelled.
+        corrections: of the poses of the scene's frames (see ``pose_of``); the rig has them already.
     """
 
     def __init__(
@@ -102,6 +115,7 @@ class Field(nn.Module):
         self.sensors, self.levels, self.region, self.unit = sensors, levels, region, unit
         self.cameras, self.rig = cameras or {}, rig or {}
         self.view_dependence = dict.fromkeys(sensors, 0)
+        self.corrections = Corrections({}, {})
         self.manifest: dict[str, Any] = {}
         extent = 2.0 if d.background else 1.0
         spheres = (d.initial_radius, d.horizon if d.background else 1e9)
@@ -117,6 +131,14 @@ class Field(nn.Module):
     @property
     def device(self) -> torch.device:
         return self.occupancy.states.device
+
+    def pose_of(self, frame: Frame) -> np.ndarray:
+        """(4, 4) camera_to_world of a frame of the scene, corrected by what the fit found.
+
+        A view that was not learned from has no correction of its own: its frames get that of their sensor alone.
+        """
+        pose = frame.camera_to_world @ self.corrections.sensors.get(frame.sensor, np.eye(4))
+        return self.corrections.views.get(frame.view, np.eye(4)) @ pose
 
     def to_normalised(self, points: np.ndarray) -> Tensor:
         """World points (..., 3) → normalised frame, float32 on the field's device."""
@@ -256,6 +278,10 @@ class Field(nn.Module):
             "sensors": [_sensor_to_json(s) for s in self.sensors.values()],
             "cameras": {n: asdict(c) for n, c in self.cameras.items()},
             "rig": {n: m.tolist() for n, m in self.rig.items()},
+            "corrections": {
+                "views": {str(v): m.tolist() for v, m in self.corrections.views.items()},
+                "sensors": {n: m.tolist() for n, m in self.corrections.sensors.items()},
+            },
         }
         self.manifest["saved"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         write_json(run / "manifest.json", self.manifest)
@@ -280,6 +306,10 @@ class Field(nn.Module):
             field = Field(Design(**stored["design"]), sensors, stored["levels"], region, stored["unit"], cameras, rig)
             field.sampling = Sampling(**stored["sampling"])
             field.view_dependence = dict(stored["view_dependence"])
+            moved = stored["corrections"]
+            field.corrections = Corrections(
+                {int(v): np.array(m) for v, m in moved["views"].items()}, {n: np.array(m) for n, m in moved["sensors"].items()}
+            )
             field.load_state_dict(load_file(run / "field.safetensors"))
         except (KeyError, TypeError) as error:
             raise InputError(f"{run / 'manifest.json'}: not the manifest of a fit of this version ({error}).") from error

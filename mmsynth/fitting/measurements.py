@@ -69,8 +69,8 @@ class Measurements:
         self.alphas = _joined([_compact(a) for a in opaque]) if self.has_alpha else None
         self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
         poses = np.stack([f.camera_to_world for f in frames])
-        self.rotations = poses[:, :3, :3].astype(np.float32)
-        self.origins = ((poses[:, :3, 3] - np.array(region.centre)) / region.radius).astype(np.float32)
+        poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
+        self.place(poses)
         self.directions, self.usable = [], []
         for camera in self.cameras:
             rays, valid = ray_map(camera)
@@ -83,6 +83,11 @@ class Measurements:
         self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
         drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
         self.level = float(self.read(drawn, pixel)[0].mean())
+
+    def place(self, poses: np.ndarray) -> None:
+        """Let the frames be at (F, 4, 4) camera_to_world, normalised frame."""
+        self.rotations = poses[:, :3, :3].astype(np.float32)
+        self.origins = poses[:, :3, 3].astype(np.float32)
 
     def pick(self, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """``count`` pixels, uniform over all frames with replacement: frame and pixel indices, (count,) each."""

@@ -28,7 +28,9 @@ from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
 from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.optimiser import Adam
+from mmsynth.fitting.poses import Rows
 from mmsynth.fitting.recipe import Recipe, load_recipe
+from mmsynth.fitting.refinement import Refinement, see
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
 from mmsynth.scene.scene import Scene
 
@@ -93,6 +95,9 @@ class Trainer:
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.state = _State(rays=recipe.rays_at_start)
+        self.task = self._task()  # now: poses are as the input has them
+        self.refinement = Refinement(scene, self.measurements, recipe, self.needs.footprint, seed)
+        self.needs.evidence.update(self.refinement.evidence)
         self.has_alpha = any(m.has_alpha for m in self.measurements.values())
         self.mean_loss = math.nan
         self.mean_error: dict[str, float] = {}
@@ -125,6 +130,9 @@ class Trainer:
             field.view_dependence.update(dict.fromkeys(self.measurements, seen))
             if self.progress >= recipe.decide_at:
                 self._decide(sampling)
+        if self.refinement.due(self.progress):
+            self.refinement.step(functools.partial(self._see, sampling), self.progress)
+            self.needs.evidence.update(self.refinement.evidence)
         total = sum(self.needs.share.values())
         rays = {n: max(1, int(state.rays * share / total)) for n, share in self.needs.share.items()}
         batch = draw(self.measurements, field.shader.columns, rays, random, self.device)
@@ -178,6 +186,12 @@ class Trainer:
     def _gain(self) -> torch.Tensor:
         """Exposure of every frame relative to their mean."""
         return torch.exp(self.log_gain - self.log_gain.mean())
+
+    def _see(self, sampling: rendering.Sampling, rays: dict[str, int], random: np.random.Generator) -> Rows:
+        batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
+        gain = self._gain().detach()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
+        beyond = self.state.decided is not None
+        return see(self.field, batch, self._per_ray(batch, self.field.view_dependence), gain, beyond, sampling)
 
     def _per_ray(self, batch: Batch, values: dict[str, Any]) -> torch.Tensor:
         """A value for each modality → one for each ray, (R,)."""
@@ -271,6 +285,7 @@ class Trainer:
             "field": self.field.state_dict(),
             "log_gain": self.log_gain.detach(),
             "optimiser": self.optimiser.state_dict(),
+            "refinement": self.refinement.state_dict(),
             "state": vars(self.state).copy(),
             "mean_loss": self.mean_loss,
             "mean_error": dict(self.mean_error),
@@ -291,14 +306,15 @@ class Trainer:
         self.field.load_state_dict(saved["field"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.log_gain.data.copy_(saved["log_gain"])
+        self.refinement.load_state_dict(saved["refinement"])
+        self.needs.evidence.update(self.refinement.evidence)
         self.state = _State(**saved["state"])
         if self.state.decided is not None:
             self.field.view_dependence.update(self.state.decided["view_dependence"])
             self.needs.evidence.update(self.state.decided["evidence"])
         self.mean_loss, self.mean_error = saved["mean_loss"], dict(saved["mean_error"])
 
-    @functools.cached_property
-    def task(self) -> dict[str, Any]:
+    def _task(self) -> dict[str, Any]:
         """What a checkpoint must agree on to be resumed: hash of the pixels and poses, recipe, seed, length."""
         digest = hashlib.sha256()
         for name, m in self.measurements.items():
@@ -415,6 +431,8 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
     field.occupancy.update(
         lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
     )
+    field.corrections = trainer.refinement.corrections()
+    field.rig = {n: pose @ field.corrections.sensors.get(n, np.eye(4)) for n, pose in field.rig.items()}
     field.manifest = {
         "mmsynth": mmsynth.__version__,
         "scene": {
@@ -426,6 +444,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
         "recipe": trainer.recipe.model_dump(),
         "needs": trainer.needs.to_json(),
         "exposure": trainer.gains(),
+        "poses": _poses(trainer, scene),
         "seed": trainer.seed,
         "steps": trainer.state.step,
         "seconds": {"fit": news.elapsed},
@@ -448,3 +467,16 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
     }
     field.save(run)
     return field
+
+
+def _poses(trainer: Trainer, scene: Scene) -> dict[str, Any]:
+    """Corrected poses and by how much: each training view that was moved, with its frames, and each sensor with its place on the rig."""
+    field, sizes = trainer.field, trainer.refinement.sizes()
+    frames = {n: scene.frames_of(n, scene.split.train) for n in field.sensors}
+    return {
+        "views": {
+            v: size | {"camera_to_world": {n: field.pose_of(f).tolist() for n, fs in frames.items() for f in fs if str(f.view) == v}}
+            for v, size in sizes["views"].items()
+        },
+        "sensors": {n: size | {"sensor_to_reference": field.rig[n].tolist()} for n, size in sizes["sensors"].items()},
+    }

@@ -69,8 +69,8 @@ def modality_arrays(sensor: Sensor, rendering: Rendering) -> dict[str, np.ndarra
     return arrays
 
 
-def source_views(scene: Scene, source: str, views: Sequence[int] | None = None) -> list[View]:
-    """Camera, pose and name (view id, 4 digits) of all frames of a sensor, or of some views.
+def source_views(field: Field, scene: Scene, source: str, views: Sequence[int] | None = None) -> list[View]:
+    """Camera, pose (as the fit corrected it) and name (view id, 4 digits) of all frames of a sensor, or of some views.
 
     Raises:
         InputError: unknown sensor or view id.
@@ -85,7 +85,7 @@ def source_views(scene: Scene, source: str, views: Sequence[int] | None = None) 
         if missing:
             raise InputError(f"view {missing[0]}: the scene has no frame of '{source}' with this id, expected some of {_ranges(known)}.")
         frames = tuple(frame for frame in frames if frame.view in set(views))
-    return [(frame.camera, frame.camera_to_world, f"{frame.view:04d}") for frame in frames]
+    return [(frame.camera, field.pose_of(frame), f"{frame.view:04d}") for frame in frames]
 
 
 def _ranges(ids: set[int]) -> str:
@@ -121,7 +121,7 @@ def convert(
     """
     # known before anything is rendered or written
     field.check_modalities([canonical_modality(target)])
-    return convert_views(field, target, source_views(scene, source, views), out, progress, source=canonical_modality(source))
+    return convert_views(field, target, source_views(field, scene, source, views), out, progress, source=canonical_modality(source))
 
 
 def convert_views(

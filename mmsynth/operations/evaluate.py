@@ -36,7 +36,7 @@ from mmsynth.errors import InputError
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.scene.images import load_frame, read_native
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
-from mmsynth.sensors.camera import ray_map
+from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.mosaic import mosaic
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_error, degree_of_linear_polarization, stokes_to_intensities
 
@@ -235,11 +235,11 @@ def _score_geometry(scores: _Scores, rendering: Rendering, truth: dict[str, np.n
         scores.add("normal_mae_deg", spectral_angle_deg(a[known], b[known]))
 
 
-def _surface_points(frame: Frame, depth_z: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _surface_points(camera: Camera, pose: np.ndarray, depth_z: np.ndarray, where: np.ndarray) -> np.ndarray:
     """World points (N, 3) of the pixels ``where``."""
-    rays = ray_map(frame.camera)[0][where]
+    rays = ray_map(camera)[0][where]
     in_camera = rays * (depth_z[where].astype(np.float64) / rays[:, 2])[:, None]
-    return in_camera @ frame.camera_to_world[:3, :3].T + frame.camera_to_world[:3, 3]
+    return in_camera @ pose[:3, :3].T + pose[:3, 3]
 
 
 def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> float | None:
@@ -282,7 +282,7 @@ def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, pro
     for frame in frames:
         sensor, mine = field.sensors[frame.sensor], scores[frame.sensor]
         started = time.perf_counter()
-        rendering = field.render(frame.camera, frame.camera_to_world, [sensor.name], geometry=False, progress=count)
+        rendering = field.render(frame.camera, field.pose_of(frame), [sensor.name], geometry=False, progress=count)
         seconds += time.perf_counter() - started
         rays += int(rendering.valid.sum())
         size = rendering.valid.shape
@@ -300,7 +300,7 @@ def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, pro
         aligned = {name: light for name, light in truth.aligned(frame.view).items() if name in names}
         shape = truth.geometry(frame.view) or {}
         started = time.perf_counter()
-        rendering = field.render(frame.camera, frame.camera_to_world, list(aligned), geometry=bool(shape), progress=count)
+        rendering = field.render(frame.camera, field.pose_of(frame), list(aligned), geometry=bool(shape), progress=count)
         seconds += time.perf_counter() - started
         rays += int(rendering.valid.sum())
         size = rendering.valid.shape
@@ -315,8 +315,8 @@ def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, pro
         if "depth_z" in shape and scene.unit == "m":
             _score_geometry(geometry, rendering, shape, where)
             surface = where & rendering.valid
-            ours.append(_surface_points(frame, rendering.depth_z, surface & np.isfinite(rendering.depth_z)))
-            true.append(_surface_points(frame, shape["depth_z"], surface & (shape["depth_z"] > 0)))
+            ours.append(_surface_points(frame.camera, field.pose_of(frame), rendering.depth_z, surface & np.isfinite(rendering.depth_z)))
+            true.append(_surface_points(frame.camera, field.pose_of(frame), shape["depth_z"], surface & (shape["depth_z"] > 0)))
     shape_scores = _values(geometry, ("depth_mae", "normal_mae_deg", "hit_rate"))
     chamfer = _chamfer(ours, true) if ours else None
     return {

@@ -146,7 +146,7 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tupl
             first = view is None
             view = frame.view if view is None else view
             measured = measured_channels(scene.sensors[name], frame)
-            rendering = field.render(frame.camera, frame.camera_to_world, [name], geometry=first)
+            rendering = field.render(frame.camera, field.pose_of(frame), [name], geometry=first)
             ours = rendering.channels[name]
             linear = previews.preview_linear(sensor, measured)
             exposure = previews.exposure_of(linear)

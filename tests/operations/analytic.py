@@ -64,6 +64,9 @@ class AnalyticField:
 
     check_modalities = Field.check_modalities
 
+    def pose_of(self, frame: Frame) -> np.ndarray:
+        return frame.camera_to_world
+
     def normal(self, p: np.ndarray) -> np.ndarray:
         step = 1e-4 * np.eye(3)
         slope = np.stack([self.distance(p + e) - self.distance(p - e) for e in step], -1)
