@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) of a field's parameters."""
+"""Adam (Kingma and Ba 2015) of a field's parameters, and their mean over the last steps."""
 
 from __future__ import annotations
 
@@ -44,3 +44,35 @@ class Adam:
         for name, saved in state["moments"].items():
             for ours, theirs in zip(self.moments[name], saved, strict=True):
                 ours.copy_(theirs)
+
+
+class Average:
+    """Exponential mean of named parameters (Polyak and Juditsky 1992): what batches shake in each is not in the mean."""
+
+    def __init__(self, parameters: dict[str, nn.Parameter]) -> None:
+        self.parameters = parameters
+        self.means: dict[str, torch.Tensor] = {}
+        self.count = 0
+
+    @torch.no_grad()
+    def update(self, length: float) -> None:
+        """Take the present values in; the mean is over about the last ``length`` times, over all when there were fewer."""
+        self.count += 1
+        weight = max(1.0 / self.count, min(1.0, 1.0 / length))
+        for name, p in self.parameters.items():
+            if name not in self.means:
+                self.means[name] = p.detach().clone()
+            self.means[name].lerp_(p, weight)
+
+    @torch.no_grad()
+    def apply(self) -> None:
+        """Let the parameters be their means; as they are where nothing was taken in."""
+        for name, mean in self.means.items():
+            self.parameters[name].copy_(mean)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"count": self.count, "means": dict(self.means)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.count = state["count"]
+        self.means = {n: mean.to(self.parameters[n].device) for n, mean in state["means"].items()}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from mmsynth.fitting.optimiser import Adam
+from mmsynth.fitting.optimiser import Adam, Average
 
 
 def _parameters(dtype: torch.dtype = torch.float32) -> dict[str, nn.Parameter]:
@@ -84,3 +84,49 @@ def test_a_restored_optimiser_goes_on_the_same_way() -> None:
         _gradients(second, step)
         c.step(1.0)
     assert all(torch.equal(p, second[n]) for n, p in whole.items())
+
+
+def _moving(average: Average, parameters: dict[str, nn.Parameter], count: int, length: float) -> list[torch.Tensor]:
+    """Values of "b" that were taken in."""
+    taken = []
+    for step in range(count):
+        torch.manual_seed(step)
+        for p in parameters.values():
+            p.data.copy_(torch.randn(p.shape))
+        taken.append(parameters["b"].detach().clone())
+        average.update(length)
+    return taken
+
+
+def test_the_mean_of_few_values_is_their_plain_mean() -> None:
+    parameters = _parameters()
+    average = Average(parameters)
+    taken = _moving(average, parameters, 9, length=20.0)
+    average.apply()
+    torch.testing.assert_close(parameters["b"].detach(), torch.stack(taken).mean(0))
+
+
+def test_the_mean_of_many_values_forgets_as_torchs_does() -> None:
+    ours, model = _parameters(), nn.Linear(1, 1)
+    average = Average(ours)
+    theirs = torch.optim.swa_utils.AveragedModel(model, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(1 - 1 / 5.0))
+    taken = _moving(average, ours, 60, length=5.0)
+    for value in taken:
+        model.bias.data.copy_(value[:1])
+        theirs.update_parameters(model)
+    # they begin otherwise; 60 values later 0.8 to the power of 60 is left of that
+    torch.testing.assert_close(average.means["b"][:1], theirs.module.bias.detach(), atol=1e-5, rtol=0)
+
+
+def test_without_a_value_nothing_is_applied_and_a_saved_mean_goes_on() -> None:
+    parameters = _parameters()
+    before = parameters["b"].detach().clone()
+    average = Average(parameters)
+    average.apply()
+    assert torch.equal(parameters["b"], before)
+    _moving(average, parameters, 4, length=3.0)
+    again = Average(parameters)
+    again.load_state_dict({"count": average.count, "means": {n: m.clone() for n, m in average.means.items()}})
+    for one in (average, again):
+        _moving(one, parameters, 3, length=3.0)
+    assert torch.equal(average.means["a.table"], again.means["a.table"])

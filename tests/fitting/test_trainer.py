@@ -41,7 +41,8 @@ SMALL = Recipe.model_validate({
     "sharpness_end": 4.0, "sharpness_until": 0.6, "step_width": 2.0, "stride": 0.7, "grazing": 0.5, "significant": 0.01, "opaque": 3.0,
     "levels_until": 0.4, "view_dependence_from": 0.3, "decide_at": 0.6, "view_dependence": 2, "exposure": "off",
     "measurements_per_cell": 1e-3, "learning_rate_sharpness": 200.0,
-    "learning_rate_grid": 2e-2, "learning_rate_network": 8e-3, "learning_rate_end": 0.1, "eikonal": 0.05, "eikonal_points": 128,
+    "learning_rate_grid": 2e-2, "learning_rate_network": 8e-3, "learning_rate_end": 0.1, "average": 0.05,
+    "eikonal": 0.05, "eikonal_points": 128,
     "emptiness": 0.02, "opacity": 0.5,
 })  # fmt: skip
 
@@ -160,6 +161,18 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, mo
     same = ("exposure", "recipe", "seed", "steps", "train_psnr", "skipped_steps", "grid_reopened")
     assert {k: resumed.manifest[k] for k in same} == {k: whole.manifest[k] for k in same}
     assert resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+
+
+@pytest.mark.parametrize("average", [0.0, 0.2])
+def test_the_field_is_the_mean_over_the_last_steps(scene: Scene, tmp_path: Path, average: float) -> None:
+    field = fit(scene, tmp_path, _recipe(average=average), steps=30)
+    saved = read_checkpoint(tmp_path)
+    assert saved is not None
+    expected = {n.removeprefix("field."): m for n, m in saved["average"]["means"].items()} if average else saved["field"]
+    for name, parameter in field.named_parameters():
+        assert torch.equal(parameter, expected[name]), name
+        # the fit itself goes on from where it was
+        assert not average or not torch.equal(parameter, saved["field"][name]), name
 
 
 def test_the_log_of_a_resumed_fit_has_every_step_once(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
