@@ -70,7 +70,8 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         background = bright > 0.05
         verdict = "on" if background else "off"
         past = f"{outside:.1%} of {rays} sampled pixels see past the region of interest"
-        evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black"
+        cost = "; costs a grid twice as wide, and rays that go on to the end" if background else ""
+        evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black{cost}"
     dim = "nothing is seen past the region of interest" if outside < 0.005 else f"what is past it has {light:.1%} of the brightest light"
     if background:
         beyond, evidence["beyond"] = False, "off: the background is modelled"
@@ -105,7 +106,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     frames = ", ".join(f"{n} {len(measurements[n].origins)} frames" for n in scarce)
     evidence["scarce"] = f"on: {frames}: learned from the geometry of the others" if scarce else "off: all modalities have enough pixels"
     pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
-    evidence["tensor_head"] = f"on: {', '.join(pol)}" if pol else "off: no polarization sensor"
+    evidence["tensor_head"] = f"on: {', '.join(pol)}; costs six outputs each" if pol else "off: no polarization sensor"
     design = Design(
         surface_levels=recipe.surface_levels,
         surface_rows_log2=_rows_log2(surface_finest, recipe.surface_rows_log2),
@@ -121,6 +122,14 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         occupancy=recipe.occupancy_resolution,
         initial_radius=radius,
     )
+    tables = (
+        f"{name} {2**rows} rows a level for about {_FACES * finest**2} cells of the finest that may hold a surface"
+        for name, rows, finest in (
+            ("surface", design.surface_rows_log2, design.surface_finest),
+            ("radiance", design.radiance_rows_log2, design.radiance_finest),
+        )
+    )
+    evidence["tables"] = ", ".join(tables)
     black = not background and outside >= 0.005
     sharpness = recipe.sharpness_end * min(1.0, seen_enough / finest) / footprint
     return Needs(design, footprint, max(sharpness, 2 * recipe.sharpness_start), black, scarce, share, evidence)

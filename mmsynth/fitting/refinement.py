@@ -110,7 +110,7 @@ class Refinement:
         wanted = {"poses": both - rig > worth, "rig": both - views > worth}
         if not any(wanted.values()) and max(views, rig) > worth:
             wanted = {"poses": views > rig, "rig": rig >= views}  # one does as well as the other
-        said_of = "would save {:.1%} of the error of rays not learned from"
+        said_of = f"would save {{:.1%}} of the error of rays not learned from, and cost {_PER_FIT:.0e} rays of the fit"
         self._settle(wanted, {"poses": f"motions of views {said_of.format(views)}", "rig": f"motions of sensors {said_of.format(rig)}"})
 
     def _settle(self, wanted: dict[str, bool], why: dict[str, str]) -> None:
