@@ -24,6 +24,7 @@ app = typer.Typer(
 bench_app = typer.Typer(no_args_is_help=True, help="Measure speed against error: a table, a plot and JSON, in bench/NAME or --out.")
 app.add_typer(bench_app, name="bench")
 RunOption = Annotated[Path | None, typer.Option("--run", help="run folder; default: the last fit made in this folder")]
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object on stdout and nothing else there")]
 SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="scene folder, or `example` for the packaged scene")]
 RecipeOption = Annotated[str | None, typer.Option(help="packaged recipe or TOML file")]
@@ -157,7 +158,7 @@ def fit(
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -326,16 +327,20 @@ def bench_fit(
     modalities: ModalitiesOption = None,
     frames: FramesOption = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    device: DeviceOption = "cpu",
     out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/fit"),
     as_json: JsonOption = False,
 ) -> None:
     """Error over time: a fit from scratch per time budget, each in a process of its own."""
     from mmsynth.bench.fit import bench_fit as measure
     from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.trainer import pick_device
 
     times = [_seconds(text, "--budgets") for text in budgets.split(",")]
     with _bar("bench fit", as_json) as show:
-        report = measure(_scene_path(scene), times, out, load_recipe(recipe), _names(modalities), _frames(frames), seed, progress=show)
+        report = measure(
+            _scene_path(scene), times, out, load_recipe(recipe), _names(modalities), _frames(frames), seed, show, pick_device(device)
+        )
     _print_report(report, as_json)
 
 
@@ -362,18 +367,20 @@ def bench_ablation(
     budget: Annotated[str | None, typer.Option(help="or its time; default 60s")] = None,
     seeds: Annotated[str, typer.Option(help="every variant is fitted with each, e.g. 0,1,2")] = "0",
     only: Annotated[str | None, typer.Option(help="names of variants; the baseline is added")] = None,
+    device: DeviceOption = "cpu",
     out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/ablation"),
     as_json: JsonOption = False,
 ) -> None:
     """What each choice is worth: variants of a fit against a baseline, in seconds and dB."""
     from mmsynth.bench.ablation import bench_ablation as measure
+    from mmsynth.fitting.trainer import pick_device
 
     if steps is not None and budget is not None:
         raise InputError("--steps and --budget: give one of the two.")
     seconds = _seconds(budget or "60s") if steps is None else None
     chosen = None if only is None else [name.strip() for name in only.split(",")]
     with _bar("bench ablation", as_json) as show:
-        report = measure(_scene_path(scene), table, out, steps, seconds, _seeds(seeds), chosen, progress=show)
+        report = measure(_scene_path(scene), table, out, steps, seconds, _seeds(seeds), chosen, show, pick_device(device))
     _print_report(report, as_json)
 
 

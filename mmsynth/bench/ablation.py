@@ -114,6 +114,7 @@ def bench_ablation(
     seeds: Sequence[int] = (0,),
     only: Sequence[str] | None = None,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> Report:
     """Fit and score every variant of a table with every seed; the report in ``out`` is renewed after every fit.
 
@@ -135,7 +136,7 @@ def bench_ablation(
     jobs = {
         f"{v.name}-seed{seed}": (
             v,
-            Job(f"{v.name}-seed{seed}", str(scene), v.fitted_recipe(), _canonical(v.modalities), v.frames, seed, steps, budget),
+            Job(f"{v.name}-seed{seed}", str(scene), v.fitted_recipe(), _canonical(v.modalities), v.frames, seed, steps, budget, device),
         )
         for seed in seeds
         for v in variants

@@ -41,6 +41,7 @@ SPEED_COLUMNS = (
     Column("cores", "cores", "d"),
     Column("threads", "threads", "d"),
     Column("seed", "seed", "d"),
+    Column("device", "device"),
 )
 MODALITY_COLUMNS = (
     Column("modality", "modality"),
@@ -70,6 +71,7 @@ def bench_fit(
     frames: Mapping[str, int] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> Report:
     """Fit a scene from scratch once per budget and score each; the report in ``out`` is renewed after every fit.
 
@@ -86,7 +88,8 @@ def bench_fit(
         raise InputError(f"budgets {', '.join(names) or 'none'}: expected one or more, each once.")
     chosen = None if modalities is None else tuple(modalities)
     jobs = [
-        Job(name, str(scene), recipe, chosen, dict(frames or {}), seed, None, budget) for name, budget in zip(names, budgets, strict=True)
+        Job(name, str(scene), recipe, chosen, dict(frames or {}), seed, None, budget, device)
+        for name, budget in zip(names, budgets, strict=True)
     ]
     results: dict[str, Any] = {"bench": "fit", "scene": str(scene), "machine": measure(), "rows": []}
     for row in run_jobs(jobs, out, progress):

@@ -41,7 +41,7 @@ class Job:
     Attributes:
         name: unique in its bench; names the file of the result. scene: folder or JSON file.
         modalities: names to fit; None: all. frames: modality → training frames to keep (``keep_frames``).
-        steps, budget: length in optimiser steps, or in seconds; one of the two.
+        steps, budget: length in optimiser steps, or in seconds; one of the two. device: cpu or cuda.
     """
 
     name: str
@@ -52,6 +52,7 @@ class Job:
     seed: int
     steps: int | None
     budget: float | None
+    device: str = "cpu"
 
     def task(self) -> dict[str, Any]:
         """What the child process has to do, ready for JSON."""
@@ -73,8 +74,8 @@ def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -
     Args:
         progress: called with (jobs done, jobs in all).
     Returns:
-        rows with ``name, identity, cores, threads, seed``, what ``worker.work`` measured, and ``mean``: each score averaged over the
-        modalities that have it (PSNR in dB).
+        rows with ``name, identity, cores, threads, seed, device``, what ``worker.work`` measured, and ``mean``: each score averaged
+        over the modalities that have it (PSNR in dB).
     Raises:
         InputError: a scene cannot be read (all are looked at before the first fit), a fit fails, or ``out`` cannot be written.
     """
@@ -91,7 +92,9 @@ def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -
             machine = {"cores": wanted["machine"]["cores"], "threads": wanted["machine"]["threads"]}
             result = run_job(job)
             mean = mean_over_modalities(result["scores"])
-            write_json(path, {"name": job.name, "seed": job.seed, **machine, **result, "mean": mean, "identity": wanted})
+            write_json(
+                path, {"name": job.name, "seed": job.seed, "device": job.device, **machine, **result, "mean": mean, "identity": wanted}
+            )
         yield read_json(path)
     if progress is not None:
         progress(len(jobs), len(jobs))
@@ -128,7 +131,7 @@ def identity(job: Job, scene: str) -> dict[str, Any]:
         **task,
         "code": code_hash(),
         "versions": machine["versions"],
-        "machine": {key: machine[key] for key in ("cpu", "cores", "threads")},
+        "machine": {key: machine[key] for key in ("cpu", "cores", "threads", *(["gpu"] if job.device == "cuda" else []))},
     }
 
 

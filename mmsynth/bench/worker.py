@@ -34,15 +34,17 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     Returns:
         ``seconds``: of the fit, from files to a field on disk, without loading the compiled kernels. ``steps``. ``rays_per_s,
         samples_per_s``: of the fit; ``render_rays_per_s``: of the test views. ``cpu_share``: processor time by wall time and threads,
-        lower than usual on a machine that others use, too. ``peak_memory_bytes``: of the process when the fit was done. ``scores``: of
-        ``evaluate``.
+        lower than usual on a machine that others use, too. ``peak_memory_bytes``: of the process when the fit was done, and on a GPU
+        ``peak_gpu_bytes`` of its tensors. ``scores``: of ``evaluate``.
     Raises:
         InputError: as ``fit`` and ``evaluate``.
     """
-    announce_compilation()
+    device = task["device"]
+    if device == "cpu":
+        announce_compilation()
     began, cpu = time.perf_counter(), time.process_time()
     scene = scene_of(task)
-    field = fit(scene, folder / "run", Recipe(**task["recipe"]), task["steps"], task["budget"], task["seed"])
+    field = fit(scene, folder / "run", Recipe(**task["recipe"]), task["steps"], task["budget"], task["seed"], device)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at
@@ -51,6 +53,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "seconds": seconds,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),
         "peak_memory_bytes": peak,
+        **({"peak_gpu_bytes": torch.cuda.max_memory_allocated()} if device == "cuda" else {}),
         **{key: field.manifest[key] for key in ("steps", "rays_per_s", "samples_per_s")},
         "render_rays_per_s": scores["rays_per_s"],
         "scores": scores,

@@ -75,6 +75,8 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     dim = "nothing is seen past the region of interest" if outside < 0.005 else f"what is past it has {light:.1%} of the brightest light"
     if background:
         beyond, evidence["beyond"] = False, "off: the background is modelled"
+    elif recipe.decide_at >= 1.0:
+        beyond, evidence["beyond"] = False, "off: it is learned once residuals have decided, which the recipe leaves out (decide_at = 1)"
     elif recipe.beyond != "auto":
         beyond, evidence["beyond"] = recipe.beyond == "on", f"{recipe.beyond}: asked for by the recipe"
     elif scene.black_background or any(m.has_alpha for m in measurements.values()):

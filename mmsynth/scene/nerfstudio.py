@@ -6,7 +6,8 @@
 * Test views: ``test_filenames`` (or all but ``train_filenames``), else ``test_ids``, else every tenth.
 * One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
   says which, and the optional top-level object ``modalities`` describes them with the keys of ``mmsdata.make_sensor``.
-* The region of interest is not in the file: see ``poses.region_from_cameras``.
+* The region of interest is not in the file: see ``poses.region_from_cameras``, and ``region_from_points`` for files with the sparse
+  points of ``ply_file_path``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.mmsdata import make_sensor, wanted_modalities
-from mmsynth.scene.poses import OPENGL_TO_OPENCV, entries, region_from_cameras, rigid, transforms_camera, whole
+from mmsynth.scene.poses import OPENGL_TO_OPENCV, entries, region_from_cameras, region_from_points, rigid, transforms_camera, whole
 from mmsynth.scene.scene import Frame, Scene, Sensor, Split, canonical_modality, make_split
 
 
@@ -90,8 +91,26 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
             raise InputError(f"{path}: view {one.view} of '{one.sensor}' is listed twice, expected every view once.")
     alpha = any(_has_alpha(image, sensors[names[source]]) for source, image in first.items() if names[source] in sensors)
     region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
+    if "ply_file_path" in meta:
+        points = _sparse_points(root / str(meta["ply_file_path"]))
+        if points is None:
+            problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
+        else:
+            region = region_from_points(points, region, np.stack([frame.camera_to_world[:3, 3] for frame in frames]))
     split = _split(meta, frames, path)
     return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
+
+
+def _sparse_points(path: Path) -> np.ndarray | None:
+    """(N, 3) finite points of a PLY file; None where there are none."""
+    import trimesh  # takes its time
+
+    try:
+        points = np.asarray(trimesh.load(path).vertices, dtype=np.float64)
+    except (OSError, ValueError, AttributeError, KeyError, IndexError):
+        return None
+    points = points[np.isfinite(points).all(1)] if points.ndim == 2 and points.shape[1] == 3 else points[:0]
+    return points if len(points) else None
 
 
 def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None:

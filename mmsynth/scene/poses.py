@@ -124,6 +124,29 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
     return Region(_triple(mean + reach * direction / length), reach * float(np.sin(np.median(half_view))))
 
 
+def region_from_points(points: np.ndarray, seen: Region, positions: np.ndarray) -> Region:
+    """A region of interest that fits what is there: the ball around the sparse points that cameras look at.
+
+    Centre: the median of the points within the region that the cameras gave. Radius: 1.1 times the distance within which 95 % of
+    them lie, and as far as the cameras' region allows: not larger than it, and cameras that were outside stay outside.
+
+    Args:
+        points: (N, 3), of structure from motion. seen: ``region_from_cameras``. positions: (M, 3) of the cameras.
+    Returns:
+        ``seen`` where fewer than 50 points lie in it.
+    """
+    centre = np.asarray(seen.centre)
+    inside = points[np.linalg.norm(points - centre, axis=1) <= seen.radius]
+    if len(inside) < 50:
+        return seen
+    middle = np.median(inside, axis=0)
+    reach = 1.1 * float(np.quantile(np.linalg.norm(inside - middle, axis=1), 0.95))
+    outside = positions[np.linalg.norm(positions - centre, axis=1) > seen.radius]
+    room = 0.9 * float(np.linalg.norm(outside - middle, axis=1).min()) if len(outside) else reach
+    radius = min(reach, seen.radius, room)
+    return Region(_triple(middle), radius) if radius > 0 else seen
+
+
 def _half_view(camera: Camera) -> float:
     """Half the larger field of view, in radians."""
     return float(np.arctan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))

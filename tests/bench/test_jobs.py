@@ -91,6 +91,7 @@ def test_a_result_that_is_there_is_not_made_again(fits: list[str], tmp_path: Pat
     "change",
     [
         {"seed": 7},
+        {"device": "cuda"},
         {"steps": 5},
         {"steps": None, "budget": 4.0},
         {"recipe": Recipe.model_validate({"eikonal": 0.3})},

@@ -78,6 +78,8 @@ def test_bad_requests_are_refused_in_one_sentence(tmp_path: Path) -> None:
     refused(call("bench", "ablation", "example", "--steps", "3", "--budget", "3s"), "--steps", "--budget")
     refused(call("bench", "ablation", "example", "--only", "nothing"), "nothing", "baseline")
     refused(call("bench", "kernels", "--threads", "99999"), "--threads")
+    refused(call("bench", "fit", "example", "--device", "tpu"), "--device", "cpu or cuda")
+    refused(call("bench", "ablation", "example", "--device", "tpu"), "--device", "cpu or cuda")
     refused(call("fit", "example", "--frames", "pol=0"), "pol")
     assert not list(tmp_path.iterdir())
     (tmp_path / "bench").write_text("a file")

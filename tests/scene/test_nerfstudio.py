@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from conftest import HEIGHT, WIDTH, frame_values, ring
 
 from mmsynth.errors import InputError
@@ -37,6 +38,23 @@ def test_poses_and_half_pixel_agree_with_opencv(write_transforms: Writer) -> Non
 def test_opengl_axes(write_transforms: Writer) -> None:
     for frame, pose in zip(read_nerfstudio(write_transforms()).frames, ring(4), strict=True):
         np.testing.assert_allclose(frame.camera_to_world, pose, atol=1e-12)
+
+
+def test_sparse_points_of_the_file_give_the_region(write_transforms: Writer) -> None:
+    plain = read_nerfstudio(write_transforms()).region
+    path = write_transforms(edit=lambda meta: meta.update(ply_file_path="sparse_pc.ply"))
+    missing = read_nerfstudio(path)
+    assert missing.region == plain and "sparse_pc.ply" in missing.problems[-1]
+    random = np.random.default_rng(0)
+    points = np.concatenate([0.3 * random.uniform(-1, 1, (500, 3)), random.uniform(-9, 9, (500, 3)), np.full((3, 3), np.nan)])
+    trimesh.PointCloud(points).export(path / "sparse_pc.ply")
+    scene = read_nerfstudio(path)
+    assert scene.region != plain and 0.3 < scene.region.radius < 0.7 and not scene.problems
+    np.testing.assert_allclose(scene.region.centre, 0, atol=0.05)
+    for broken in (b"", b"ply\nformat ascii 1.0\nelement vertex 9\n", random.bytes(200)):
+        (path / "sparse_pc.ply").write_bytes(broken)
+        scene = read_nerfstudio(path)
+        assert scene.region == plain and "sparse_pc.ply" in scene.problems[-1], broken
 
 
 def test_per_frame_intrinsics_win(write_transforms: Writer) -> None:

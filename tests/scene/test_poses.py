@@ -12,7 +12,7 @@ import pytest
 from conftest import OPENCV_TO_OPENGL, look_at, ring
 
 from mmsynth.errors import InputError
-from mmsynth.scene.poses import read_poses, region_from_cameras, rigid
+from mmsynth.scene.poses import read_poses, region_from_cameras, region_from_points, rigid
 from mmsynth.sensors.camera import Camera
 
 CAMERA = Camera(24, 18, 25.0, 25.0, 11.5, 8.5)
@@ -142,6 +142,31 @@ def test_region_leaves_the_nearest_camera_outside() -> None:
     poses = [*ring(8), look_at((0.0, 1.2, 0.4))]
     region = region_from_cameras([wide] * 9, poses)
     assert min(np.linalg.norm(pose[:3, 3] - region.centre) for pose in poses) > region.radius
+
+
+def test_sparse_points_fit_the_region_to_what_is_there() -> None:
+    random = np.random.default_rng(0)
+    poses = ring(12)
+    seen = region_from_cameras([CAMERA] * 12, poses)
+    positions = np.stack([pose[:3, 3] for pose in poses])
+    directions = random.normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    thing = np.array([0.2, -0.1, 0.3]) + 0.5 * directions[:2000]
+    walls, strays = 8.0 * directions[2000:], random.uniform(-0.9, 0.9, (40, 3))
+    region = region_from_points(np.concatenate([thing, walls, strays]), seen, positions)
+    np.testing.assert_allclose(region.centre, (0.2, -0.1, 0.3), atol=0.05)
+    assert 0.5 < region.radius < 0.62 < seen.radius
+
+
+def test_sparse_points_leave_cameras_outside_and_few_say_nothing() -> None:
+    poses = ring(12)
+    seen = region_from_cameras([CAMERA] * 12, poses)
+    positions = np.stack([pose[:3, 3] for pose in poses])
+    everywhere = np.random.default_rng(0).uniform(-4, 4, (5000, 3))
+    region = region_from_points(everywhere, seen, positions)
+    assert region.radius <= seen.radius and np.linalg.norm(positions - region.centre, axis=1).min() > region.radius
+    assert region_from_points(everywhere[:40], seen, positions) == seen
+    assert region_from_points(np.zeros((100, 3)), seen, positions) == seen  # all in one place: no size
 
 
 DEGENERATE: dict[str, Callable[[], list[np.ndarray]]] = {
