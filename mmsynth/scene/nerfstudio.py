@@ -7,7 +7,7 @@
 * One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
   says which, and the optional top-level object ``modalities`` describes them with the keys of ``mmsdata.make_sensor``.
 * The region of interest is not in the file: see ``poses.region_from_cameras``, and ``region_from_points`` for files with the sparse
-  points of ``ply_file_path``.
+  points of ``ply_file_path`` and for pictures with calibration boards.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
+from mmsynth.scene.boards import board_points
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.mmsdata import make_sensor, wanted_modalities
 from mmsynth.scene.poses import OPENGL_TO_OPENCV, entries, region_from_cameras, region_from_points, rigid, transforms_camera, whole
@@ -91,12 +92,16 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
             raise InputError(f"{path}: view {one.view} of '{one.sensor}' is listed twice, expected every view once.")
     alpha = any(_has_alpha(image, sensors[names[source]]) for source, image in first.items() if names[source] in sensors)
     region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
+    stands = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
     if "ply_file_path" in meta:
         points = _sparse_points(root / str(meta["ply_file_path"]))
         if points is None:
             problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
         else:
-            region = region_from_points(points, region, np.stack([frame.camera_to_world[:3, 3] for frame in frames]))
+            region = region_from_points(points, region, stands)
+    else:
+        plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
+        region = region_from_points(board_points(plain), region, stands) if plain else region
     split = _split(meta, frames, path)
     return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
 
@@ -106,8 +111,8 @@ def _sparse_points(path: Path) -> np.ndarray | None:
     import trimesh  # takes its time
 
     try:
-        points = np.asarray(trimesh.load(path).vertices, dtype=np.float64)
-    except (OSError, ValueError, AttributeError, KeyError, IndexError):
+        points = np.asarray(getattr(trimesh.load(path), "vertices", ()), dtype=np.float64)
+    except (OSError, ValueError, KeyError, IndexError):
         return None
     points = points[np.isfinite(points).all(1)] if points.ndim == 2 and points.shape[1] == 3 else points[:0]
     return points if len(points) else None
