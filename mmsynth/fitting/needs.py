@@ -95,8 +95,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     seen = f", {coarser:.1f} pixels apart for {rays_to_come:.1e} rays on {pixels:.1e} pixels" if coarser > 1 else ""
     few = f", the surface's for {recipe.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
     evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}{few}"
-    # measured: a large sphere fills hollows between objects, and stays there painted
-    radius = recipe.initial_radius or (0.4 if background else 0.15)
+    radius = recipe.initial_radius or (0.4 if background else 0.5)
     farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in measurements.values())
     # measured: what starts far behind the scene reaches it late, and in streaks
     horizon = recipe.horizon or 2.0 - 1.0 / (_HORIZON * max(farthest, 1.0))
