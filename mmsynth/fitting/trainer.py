@@ -173,7 +173,7 @@ class Trainer:
         degrees = self._per_ray(batch, field.view_dependence)
         # a few frames would bend geometry, appearance and trunk to themselves: scarce modalities teach their own head alone
         teaches = self._per_ray(batch, {n: n not in self.needs.scarce for n in batch.parts})
-        gain = self._gain()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
+        gain = self._gain_of(batch)
         # light from beyond the region would explain what is in it as long as that has no shape
         shaded = field.to_shade(hits) if self.state.decided else (hits.features, hits.opacity)
         loss, squared = losses.compare(field.shader, *shaded, batch, degrees, teaches, gain)
@@ -192,11 +192,14 @@ class Trainer:
         """Exposure of every frame relative to their mean."""
         return torch.exp(self.log_gain - self.log_gain.mean())
 
+    def _gain_of(self, batch: Batch) -> torch.Tensor | None:
+        """Exposure of each number's frame, (M,); None where no gains were needed."""
+        return self._gain()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
+
     def _see(self, sampling: rendering.Sampling, rays: dict[str, int], random: np.random.Generator) -> Rows:
         batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
-        gain = self._gain().detach()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
         beyond = self.state.decided is not None
-        return see(self.field, batch, self._per_ray(batch, self.field.view_dependence), gain, beyond, sampling)
+        return see(self.field, batch, self._per_ray(batch, self.field.view_dependence), self._gain_of(batch), beyond, sampling)
 
     def _per_ray(self, batch: Batch, values: dict[str, Any]) -> torch.Tensor:
         """A value for each modality → one for each ray, (R,)."""
