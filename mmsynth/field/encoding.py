@@ -24,10 +24,9 @@ class HashGrid(nn.Module):
         super().__init__()
         growth = (max(finest, coarsest) / coarsest) ** (1.0 / max(levels - 1, 1))
         resolutions = [int(coarsest * growth**i + 0.5) for i in range(levels)]
-        rows = [min((r + 1) ** 3, 2**rows_log2) for r in resolutions]
         self.register_buffer("resolutions", torch.tensor(resolutions), persistent=False)
-        self.register_buffer("offsets", torch.tensor([sum(rows[:i]) for i in range(levels + 1)]), persistent=False)
-        self.table = nn.Parameter(torch.empty(sum(rows), FEATURES).uniform_(-1e-4, 1e-4))
+        self.register_buffer("offsets", _offsets(resolutions, rows_log2), persistent=False)
+        self.table = nn.Parameter(torch.empty(int(self.offsets[-1]), FEATURES).uniform_(-1e-4, 1e-4))
         self.extent = extent
 
     @property
@@ -39,6 +38,29 @@ class HashGrid(nn.Module):
         """Cell size of the finest active level."""
         return 2.0 * self.extent / float(self.resolutions[min(active, len(self.resolutions)) - 1])
 
+    def grow(self, rows_log2: int) -> Tensor:
+        """Give every level up to 2^rows_log2 rows without a change of any value: (T,) the row that each new one is a copy of.
+
+        Raises:
+            ValueError: a level would lose rows.
+        """
+        resolutions = self.resolutions.tolist()
+        before, after = self.offsets.tolist(), _offsets(resolutions, rows_log2).tolist()
+        sources = []
+        for level, resolution in enumerate(resolutions):
+            had, has = before[level + 1] - before[level], after[level + 1] - after[level]
+            if has < had:
+                raise ValueError(f"level {level} has {had} rows, cannot grow to {has}")
+            source = torch.arange(has)
+            if had < (resolution + 1) ** 3 <= has:
+                axis = torch.arange(resolution + 1)
+                source = kernels.reference.row_of(torch.cartesian_prod(axis, axis, axis), resolution, had)
+            sources.append(before[level] + source % had)  # the hash of twice as many rows has the same low bits
+        source = torch.cat(sources).to(self.table.device)
+        self.offsets = torch.tensor(after, device=self.offsets.device)
+        self.table.data, self.table.grad = self.table.data[source], None
+        return source
+
     def place(self, points: Tensor) -> Tensor:
         """Points of the normalised frame in the grid's own: contracted space where it is wider than the region."""
         return kernels.contract(points) if self.extent > 1.0 else points
@@ -47,6 +69,11 @@ class HashGrid(nn.Module):
         """(N, 3) → (N, width); levels from ``active`` on are zero and cost nothing."""
         unit = (positions * (0.5 / self.extent) + 0.5).clamp(0.0, 1.0)
         return kernels.hash_encode(unit, self.table, self.resolutions, self.offsets, active)
+
+
+def _offsets(resolutions: list[int], rows_log2: int) -> Tensor:
+    rows = [min((r + 1) ** 3, 2**rows_log2) for r in resolutions]
+    return torch.tensor([sum(rows[:i]) for i in range(len(rows) + 1)])
 
 
 def spherical_harmonics(d: Tensor) -> Tensor:

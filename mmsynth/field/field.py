@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +139,14 @@ class Field(nn.Module):
         """
         pose = frame.camera_to_world @ self.corrections.sensors.get(frame.sensor, np.eye(4))
         return self.corrections.views.get(frame.view, np.eye(4)) @ pose
+
+    def grow_tables(self, surface_rows_log2: int, radiance_rows_log2: int) -> dict[str, Tensor]:
+        """More rows for the hash tables, without a change of the field: by parameter, the row that each new one is a copy of."""
+        self.design = replace(self.design, surface_rows_log2=surface_rows_log2, radiance_rows_log2=radiance_rows_log2)
+        return {
+            "surface.grid.table": self.surface.grid.grow(surface_rows_log2),
+            "appearance.table": self.appearance.grow(radiance_rows_log2),
+        }
 
     def to_normalised(self, points: np.ndarray) -> Tensor:
         """World points (..., 3) → normalised frame, float32 on the field's device."""

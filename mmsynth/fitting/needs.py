@@ -15,6 +15,7 @@ import numpy as np
 from mmsynth.field.field import Design
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.tables import LEAST
 from mmsynth.scene.scene import Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
@@ -110,10 +111,10 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     evidence["tensor_head"] = f"on: {', '.join(pol)}; costs six outputs each" if pol else "off: no polarization sensor"
     design = Design(
         surface_levels=recipe.surface_levels,
-        surface_rows_log2=_rows_log2(surface_finest, recipe.surface_rows_log2),
+        surface_rows_log2=recipe.surface_rows_log2 if recipe.tables_at == 0 else min(LEAST, recipe.surface_rows_log2),
         surface_finest=surface_finest,
         radiance_levels=recipe.radiance_levels,
-        radiance_rows_log2=_rows_log2(radiance_finest, recipe.radiance_rows_log2),
+        radiance_rows_log2=recipe.radiance_rows_log2 if recipe.tables_at == 0 else min(LEAST, recipe.radiance_rows_log2),
         radiance_finest=radiance_finest,
         background=background,
         beyond=beyond,
@@ -123,14 +124,8 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         occupancy=recipe.occupancy_resolution,
         initial_radius=radius,
     )
-    tables = (
-        f"{name} {2**rows} rows a level for about {_FACES * finest**2} cells of the finest that may hold a surface"
-        for name, rows, finest in (
-            ("surface", design.surface_rows_log2, design.surface_finest),
-            ("radiance", design.radiance_rows_log2, design.radiance_finest),
-        )
-    )
-    evidence["tables"] = ", ".join(tables)
+    if recipe.tables_at == 0:
+        evidence["tables"] = f"2^{design.surface_rows_log2} and 2^{design.radiance_rows_log2} rows a level: asked for by the recipe"
     black = not background and outside >= 0.005
     sharpness = recipe.sharpness_end * min(1.0, seen_enough / finest) / footprint
     return Needs(design, footprint, max(sharpness, 2 * recipe.sharpness_start), black, scarce, share, evidence)
@@ -141,11 +136,6 @@ def _shares(measurements: dict[str, Measurements], below: float) -> dict[str, fl
     pixels = {n: int(m.ends[-1]) for n, m in measurements.items()}
     enough = below * max(pixels.values())
     return {n: min(1.0, count / enough) if enough else 1.0 for n, count in pixels.items()}
-
-
-def _rows_log2(finest: int, most: int) -> int:
-    """Rows for the cells that a surface can occupy: about the faces of a cube at the finest level, at most 2^most."""
-    return min(most, math.ceil(math.log2(_FACES * finest**2)))
 
 
 def _footprint(measurements: dict[str, Measurements]) -> float:

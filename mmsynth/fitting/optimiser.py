@@ -22,13 +22,24 @@ class Adam:
         self.count = 0
 
     @torch.no_grad()
-    def step(self, factor: float, slower: dict[str, float] | None = None) -> None:
-        """One step with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too."""
+    def step(self, factor: float, slower: dict[str, float] | None = None, rows: dict[str, int] | None = None) -> None:
+        """One step with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too.
+
+        Args:
+            rows: how many of the first rows of a parameter were ever met: without a gradient the others would stay as they are.
+        """
         self.count += 1
         for name, p in self.parameters.items():
             if p.grad is not None:
                 rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
-                kernels.adam(p, p.grad, *self.moments[name], rate, *_BETAS, _EPSILON, self.count)
+                met = slice((rows or {}).get(name))
+                first, second = self.moments[name]
+                kernels.adam(p[met], p.grad[met], first[met], second[met], rate, *_BETAS, _EPSILON, self.count)
+
+    def take(self, name: str, rows: torch.Tensor) -> None:
+        """Follow a parameter whose rows became copies of ``rows`` of what it was."""
+        first, second = self.moments[name]
+        self.moments[name] = first[rows], second[rows]
 
     def clear(self) -> None:
         """Drop the gradients without a step."""
@@ -58,11 +69,16 @@ class Average:
     def update(self, length: float) -> None:
         """Take the present values in; the mean is over about the last ``length`` times, over all when there were fewer."""
         self.count += 1
-        weight = max(1.0 / self.count, min(1.0, 1.0 / length))
+        weight = max(1.0 / self.count, 1.0 / max(length, 1.0))
         for name, p in self.parameters.items():
             if name not in self.means:
                 self.means[name] = p.detach().clone()
             self.means[name].lerp_(p, weight)
+
+    def take(self, name: str, rows: torch.Tensor) -> None:
+        """Follow a parameter whose rows became copies of ``rows`` of what it was."""
+        if name in self.means:
+            self.means[name] = self.means[name][rows]
 
     @torch.no_grad()
     def apply(self) -> None:

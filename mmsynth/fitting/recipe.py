@@ -22,11 +22,15 @@ class Recipe(BaseModel):
         "auto", description="where the background is not modelled: what passes the region has a colour per direction, and is not black"
     )
     surface_levels: int = Field(5, ge=1, le=16)
-    surface_rows_log2: int = Field(16, ge=8, le=22)
+    surface_rows_log2: int = Field(16, ge=8, le=22, description="log2 of the most rows that a level may have")
     radiance_levels: int = Field(6, ge=1, le=16)
     radiance_rows_log2: int = Field(17, ge=8, le=22)
     surface_cells: float = Field(2.0, gt=0, description="finest surface grid: cells per two pixel footprints")
     radiance_cells: float = Field(4.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
+    cells_per_row: float = Field(3.0, gt=0, description="cells of the finest level at the surface that share a row of its hash table")
+    tables_at: float = Field(
+        0.1, ge=0, le=0.5, description="progress at which these cells are counted and the tables get their rows; 0: the most from the start"
+    )
     measurements_per_cell: float = Field(
         10.0, gt=0, description="rays that must see a cell of the finest surface grid, on the average; fewer: coarser and softer"
     )
@@ -55,7 +59,7 @@ class Recipe(BaseModel):
     view_dependence_from: float = Field(0.3, ge=0, le=1, description="progress before which radiance has no direction")
     poses: Literal["auto", "on", "off"] = Field("auto", description="a motion of every view")
     rig: Literal["auto", "on", "off"] = Field("auto", description="a motion of every sensor but the first, the same in all views")
-    poses_at: float = Field(0.25, ge=0, le=1, description="progress at which residuals decide on motions, and from which cameras move")
+    poses_at: float = Field(0.3, ge=0, le=1, description="progress at which residuals decide on motions, and from which cameras move")
     poses_worth: float = Field(0.01, gt=0, description="share of the error of rays not learned from that motions must save")
     decide_at: float = Field(0.6, ge=0, le=1, description="progress at which residuals decide on directions and exposure")
     view_dependence: Literal["auto", 0, 1, 2, 3] = Field("auto", description="degree of the harmonics of radiance over directions")

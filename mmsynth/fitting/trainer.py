@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from mmsynth.fitting.poses import Rows
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.refinement import Refinement, see
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
+from mmsynth.fitting.tables import cells_at_surface, rows_log2
 from mmsynth.scene.scene import Scene
 
 CHECKPOINT_SECONDS = 60.0
@@ -63,6 +64,7 @@ class _State:
     samples_total: int = 0
     bad_steps: int = 0
     reopened: int = 0
+    tables: dict[str, Any] | None = None
     decided: dict[str, Any] | None = None
 
 
@@ -126,6 +128,8 @@ class Trainer:
             sdf = lambda x: field.surface(x, sampling.active_surface)
             if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
                 state.reopened += 1
+        if state.tables is None and 0 < recipe.tables_at <= self.progress:
+            self._size_tables(sampling, generator)
         if state.decided is None:
             # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
             seen = 0 if self.progress < recipe.view_dependence_from else probe.DEGREES
@@ -149,7 +153,12 @@ class Trainer:
             self._skip("a gradient is not finite")
             return
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, recipe))
-        self.optimiser.step(learning_rate_factor(self.progress, recipe), slower)
+        grids = {
+            "surface.grid.table": (field.surface.grid, sampling.active_surface),
+            "appearance.table": (field.appearance, sampling.active_radiance),
+        }
+        rows = {n: int(grid.offsets[active]) for n, (grid, active) in grids.items()}
+        self.optimiser.step(learning_rate_factor(self.progress, recipe), slower, rows)
         keep = 0.98 if state.step else 0.0
         first = math.isnan(self.mean_loss)  # also after steps that were skipped
         self.mean_loss = float(loss.detach()) if first else keep * self.mean_loss + (1 - keep) * float(loss.detach())
@@ -205,6 +214,24 @@ class Trainer:
         """A value for each modality → one for each ray, (R,)."""
         counts = [rays.stop - rays.start for rays, _ in batch.parts.values()]
         return torch.from_numpy(np.repeat([values[n] for n in batch.parts], counts)).to(self.device)
+
+    def _size_tables(self, sampling: rendering.Sampling, generator: torch.Generator) -> None:
+        """Give the hash tables rows for the cells at the surface, as it is now."""
+        recipe, needs = self.recipe, self.needs
+        cells = cells_at_surface(self.field, sampling.active_surface, generator)
+        most = recipe.surface_rows_log2, recipe.radiance_rows_log2
+        rows = [rows_log2(n, recipe.cells_per_row, m) for n, m in zip(cells, most, strict=True)]
+        needs.evidence["tables"] = ", ".join(
+            f"{name} 2^{r} rows a level for {n:.2g} cells at the surface{' (the most)' if r == m else ''}"
+            for name, n, r, m in zip(("surface", "radiance"), cells, rows, most, strict=True)
+        )
+        self._grow_tables(rows)
+        self.state.tables = {"rows_log2": rows, "evidence": needs.evidence["tables"]}
+
+    def _grow_tables(self, rows: Sequence[int]) -> None:
+        for name, sources in self.field.grow_tables(*rows).items():
+            self.optimiser.take(name, sources)
+            self.average.take(name, sources)
 
     @torch.no_grad()
     def _decide(self, sampling: rendering.Sampling) -> None:
@@ -312,13 +339,16 @@ class Trainer:
                 raise InputError(
                     f"checkpoint: was made with {key} {theirs.get(key)}, this fit has {value}; give another --run or the same options."
                 )
+        self.state = _State(**saved["state"])
+        if self.state.tables is not None:
+            self._grow_tables(self.state.tables["rows_log2"])
+            self.needs.evidence["tables"] = self.state.tables["evidence"]
         self.field.load_state_dict(saved["field"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.log_gain.data.copy_(saved["log_gain"])
         self.average.load_state_dict(saved["average"])
         self.refinement.load_state_dict(saved["refinement"])
         self.needs.evidence.update(self.refinement.evidence)
-        self.state = _State(**saved["state"])
         if self.state.decided is not None:
             self.field.view_dependence.update(self.state.decided["view_dependence"])
             self.needs.evidence.update(self.state.decided["evidence"])

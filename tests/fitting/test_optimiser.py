@@ -56,6 +56,41 @@ def test_a_parameter_without_a_gradient_stays() -> None:
     assert optimiser.count == 1
 
 
+@pytest.mark.parametrize("met", [0, 20, 50])
+def test_rows_that_were_never_met_need_no_step(met: int) -> None:
+    whole, part = _parameters(), _parameters()
+    a, b = (Adam(p, dict.fromkeys(p, 0.1)) for p in (whole, part))
+    for step in range(3):
+        for parameters in (whole, part):
+            _gradients(parameters, step)
+            parameters["a.table"].grad[met:] = 0.0  # type: ignore[index]
+        a.step(1.0)
+        b.step(1.0, rows={"a.table": met})
+    for name, p in whole.items():
+        torch.testing.assert_close(part[name], p, atol=1e-6, rtol=0)
+
+
+def test_an_optimiser_and_a_mean_follow_rows_that_are_copied() -> None:
+    parameters = _parameters()
+    optimiser, average = Adam(parameters, dict.fromkeys(parameters, 0.1)), Average(parameters)
+    _gradients(parameters, 0)
+    optimiser.step(1.0)
+    average.update(4.0)
+    moments, mean = [m.clone() for m in optimiser.moments["a.table"]], average.means["a.table"].clone()
+    source = torch.arange(120) % 50
+    table = parameters["a.table"]
+    table.data, table.grad = table.data[source], None
+    optimiser.take("a.table", source)
+    average.take("a.table", source)
+    average.take("b", torch.arange(7))
+    assert all(torch.equal(m, old[source]) for m, old in zip(optimiser.moments["a.table"], moments, strict=True))
+    assert torch.equal(average.means["a.table"], mean[source])
+    _gradients(parameters, 1)
+    optimiser.step(1.0)
+    average.update(4.0)
+    assert table.shape == average.means["a.table"].shape == (120, 4)
+
+
 def test_cleared_gradients_change_nothing() -> None:
     parameters = _parameters()
     optimiser = Adam(parameters, dict.fromkeys(parameters, 0.1))

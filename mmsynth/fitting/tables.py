@@ -1,0 +1,38 @@
+"""How many rows the hash tables need: counted once the surface has taken shape."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from mmsynth.field.field import Field
+from mmsynth.field.kernels import SHELL
+
+LEAST = 13  # log2 of the rows that a level has before anything is counted: a grid 16 cells across is dense
+_PROBES = 65536
+_CROSSED = 0.75  # of a cell's size: mean distance within which a plane crosses a cube, (|n_x| + |n_y| + |n_z|) / 2 over all n
+
+
+@torch.no_grad()
+def cells_at_surface(field: Field, active: int, generator: torch.Generator) -> tuple[float, float]:
+    """About how many cells of the finest level of the surface's and of the radiance's grid the surface crosses.
+
+    Random points of the occupancy grid's shell: the share of them that lies within half a cell of the surface, times the cells
+    that the shell has. ``active``: levels of the surface's grid in use.
+    """
+    states, grid = field.occupancy.states, field.surface.grid
+    shell, extent, across = torch.nonzero(states == SHELL), grid.extent, states.shape[0]
+    chosen = torch.randint(len(shell), (_PROBES,), generator=generator).to(shell.device)
+    points = shell[chosen] + torch.rand(_PROBES, 3, generator=generator).to(shell.device)
+    distance = field.surface((points * (2.0 / across) - 1.0) * extent, active).abs()
+
+    def count(cell: float) -> float:
+        return float((distance < _CROSSED * cell).float().mean()) * len(shell) * (2.0 * extent / across / cell) ** 3
+
+    return count(grid.cell(len(grid.resolutions))), count(field.appearance.cell(len(field.appearance.resolutions)))
+
+
+def rows_log2(cells: float, cells_per_row: float, most: int) -> int:
+    """log2 of a level's rows: the nearest power of two, at least what it began with, at most 2^most."""
+    return min(most, max(LEAST, round(math.log2(max(cells / cells_per_row, 1.0)))))

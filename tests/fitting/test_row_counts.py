@@ -1,0 +1,151 @@
+"""Hash tables get the rows that the surface asks for, in the middle of a fit, and nothing else changes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mmsynth.data import data_folder
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.field import Design, Field
+from mmsynth.fitting import trainer as trainer_module
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.tables import LEAST, cells_at_surface, rows_log2
+from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import Region, Scene, Sensor
+
+SMALL: dict[str, Any] = {
+    "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "radiance_levels": 4, "occupancy_resolution": 24,
+    "occupancy_every": 4, "eikonal_points": 64, "radiance_hidden": 32, "surface_rows_log2": 16, "radiance_rows_log2": 17,
+    "radiance_cells": 60.0, "cells_per_row": 2.0, "tables_at": 0.25, "poses": "off", "rig": "off", "average": 0.25, "view_dependence": 1, "exposure": "off",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene(data_folder("example_scene"), ["rgb", "nir"])
+
+
+def _ball(radius: float, **sizes: Any) -> Field:
+    """A new field: exactly a ball."""
+    design = Design(**{"surface_levels": 3, "radiance_levels": 3, "occupancy": 48, "initial_radius": radius, **sizes})
+    field = Field(design, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}, Region((0.0, 0.0, 0.0), 1.0))
+    sdf = lambda x: field.surface(x, 3)
+    for step in range(3):
+        field.occupancy.update(sdf, 60.0, torch.Generator().manual_seed(step), 1.0)
+    return field
+
+
+def _crossed(radius: float, across: int) -> int:
+    """Cells of [-1, 1]³ with corners inside the ball and outside of it, all looked at."""
+    axis = np.linspace(-1.0, 1.0, across + 1)
+    inside = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < radius**2
+    corners = [inside[i : across + i, j : across + j, k : across + k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    return int((np.any(corners, 0) & ~np.all(corners, 0)).sum())
+
+
+@pytest.mark.parametrize("radius", [0.2, 0.5, 0.8])
+def test_the_count_is_that_of_cells_with_corners_on_both_sides(radius: float) -> None:
+    field = _ball(radius, surface_finest=64, radiance_finest=160)
+    surface, radiance = cells_at_surface(field, 3, torch.Generator().manual_seed(0))
+    assert surface == pytest.approx(_crossed(radius, 64), rel=0.05)
+    assert radiance == pytest.approx(_crossed(radius, 160), rel=0.05)
+
+
+def test_rows_stay_within_what_a_table_began_with_and_the_recipe_allows() -> None:
+    assert rows_log2(2.0**15 * 3, 3.0, 19) == 15
+    assert rows_log2(2.0**15 * 3 * 1.4, 3.0, 19) == 15 and rows_log2(2.0**15 * 3 * 1.5, 3.0, 19) == 16  # the nearest
+    assert rows_log2(0.0, 3.0, 19) == LEAST and rows_log2(1e12, 3.0, 19) == 19
+    assert rows_log2(1e12, 3.0, 9) == rows_log2(0.0, 3.0, 9) == 9  # a recipe may ask for less than the least
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    levels=st.integers(1, 5), few=st.integers(6, 12), more=st.integers(0, 6), coarsest=st.integers(2, 12), finer=st.integers(1, 6),
+    seed=st.integers(0, 99),
+)  # fmt: skip
+def test_growing_changes_no_value(levels: int, few: int, more: int, coarsest: int, finer: int, seed: int) -> None:
+    """Hashed levels that stay hashed, that become dense, and that were dense."""
+    torch.manual_seed(seed)
+    grid = HashGrid(levels, few, coarsest, coarsest * finer)
+    grid.table.data.normal_()
+    x = torch.rand(200, 3) * 2 - 1
+    before, table, old = grid(x, levels).detach(), grid.table, grid.table.detach().clone()
+    source = grid.grow(few + more)
+    assert grid.table is table and torch.equal(grid.table.detach(), old[source])
+    assert torch.equal(grid(x, levels).detach(), before)
+    expected = HashGrid(levels, few + more, coarsest, coarsest * finer)
+    assert torch.equal(grid.offsets, expected.offsets) and grid.table.shape == expected.table.shape
+
+
+def test_a_table_does_not_shrink() -> None:
+    with pytest.raises(ValueError, match="cannot grow"):
+        HashGrid(2, 12, 16, 64).grow(11)
+
+
+def test_a_fit_sizes_its_tables_once_and_says_so(scene: Scene) -> None:
+    trainer = Trainer(scene, Recipe.model_validate(SMALL), 16, None, 0, "cpu")
+    assert trainer.field.design.surface_rows_log2 == trainer.field.design.radiance_rows_log2 == LEAST
+    assert "tables" not in trainer.needs.evidence
+    while trainer.progress < 0.25:
+        trainer.run_step()
+    before = trainer.field.surface.grid.table.detach().clone()
+    trainer.run_step()
+    design, evidence = trainer.field.design, trainer.needs.evidence["tables"]
+    assert LEAST < design.radiance_rows_log2 <= 17 and f"radiance 2^{design.radiance_rows_log2} rows" in evidence
+    assert len(trainer.field.appearance.table) == int(trainer.field.appearance.offsets[-1])
+    for name, moments in trainer.optimiser.moments.items():
+        assert all(m.shape == trainer.optimiser.parameters[name].shape for m in moments)
+    while trainer.progress < 1:
+        trainer.run_step()
+    assert trainer.field.design == design and not torch.equal(trainer.field.surface.grid.table[: len(before)], before)
+    assert trainer.state.bad_steps == 0
+
+
+def test_a_small_object_gets_smaller_tables_than_a_large_one(scene: Scene) -> None:
+    rows = {}
+    for radius in (0.1, 0.6):
+        recipe = Recipe.model_validate({**SMALL, "initial_radius": radius, "learning_rate_grid": 1e-9, "learning_rate_network": 1e-9})
+        trainer = Trainer(scene, recipe, 16, None, 0, "cpu")  # what it starts from is what it keeps
+        while trainer.state.tables is None:
+            trainer.run_step()
+        rows[radius] = trainer.field.design
+    assert rows[0.1].radiance_rows_log2 < rows[0.6].radiance_rows_log2
+
+
+def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
+    trainer = Trainer(scene, Recipe.model_validate({**SMALL, "tables_at": 0.0}), 8, None, 0, "cpu")
+    assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
+    assert "asked for by the recipe" in trainer.needs.evidence["tables"]
+    design = trainer.field.design
+    while trainer.progress < 1:
+        trainer.run_step()
+    assert trainer.field.design == design and trainer.state.tables is None
+
+
+@pytest.mark.parametrize("killed_at", [3, 9])
+def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
+) -> None:
+    recipe = Recipe.model_validate(SMALL)
+    whole = fit(scene, tmp_path / "whole", recipe, steps=16)
+    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+
+    def kill(news: trainer_module.Progress) -> None:
+        if news.step == killed_at:
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        fit(scene, tmp_path / "cut", recipe, steps=16, on_step=kill)
+    resumed = fit(scene, tmp_path / "cut", recipe, resume=True)
+    assert resumed.design == whole.design and resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+    for name, value in whole.state_dict().items():
+        assert torch.equal(resumed.state_dict()[name], value), name
+    loaded = Field.load(tmp_path / "cut")
+    assert loaded.design == replace(whole.design) and torch.equal(loaded.surface.grid.table, whole.surface.grid.table)
