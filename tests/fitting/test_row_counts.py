@@ -23,7 +23,8 @@ from mmsynth.scene.scene import Region, Scene, Sensor
 SMALL: dict[str, Any] = {
     "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "radiance_levels": 4, "occupancy_resolution": 24,
     "occupancy_every": 4, "eikonal_points": 64, "radiance_hidden": 32, "surface_rows_log2": 16, "radiance_rows_log2": 17,
-    "radiance_cells": 60.0, "cells_per_row": 2.0, "tables_at": 0.25, "poses": "off", "rig": "off", "average": 0.25, "view_dependence": 1, "exposure": "off",
+    "radiance_cells": 60.0, "cells_per_row": 2.0, "tables_at": 0.25, "poses": "off", "rig": "off", "average": 0.25, "view_dependence": 1,
+    "exposure": "off",
 }  # fmt: skip
 
 
