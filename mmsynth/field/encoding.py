@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
 from mmsynth.field.kernels.cpu_blocks import FEATURES
 
+_START = 1e-4  # features of a new level are that small
+
 
 class HashGrid(nn.Module):
     """Multiresolution hash grid over the cube [-extent, extent]³ (Müller et al. 2022), 4 features per level.
 
     Args:
-        levels: number of levels. rows_log2: log2 of the most rows a level may have; coarse levels take what they need.
+        levels: number of levels. rows_log2: log2 of the most rows, of all levels or of each; coarse levels take what they need.
         coarsest, finest: cells per axis of the first and the last level; geometric in between.
     """
 
     resolutions: Tensor
     offsets: Tensor
 
-    def __init__(self, levels: int, rows_log2: int, coarsest: int, finest: int, extent: float = 1.0) -> None:
+    def __init__(self, levels: int, rows_log2: int | Sequence[int], coarsest: int, finest: int, extent: float = 1.0) -> None:
         super().__init__()
         growth = (max(finest, coarsest) / coarsest) ** (1.0 / max(levels - 1, 1))
         resolutions = [int(coarsest * growth**i + 0.5) for i in range(levels)]
         self.register_buffer("resolutions", torch.tensor(resolutions), persistent=False)
         self.register_buffer("offsets", _offsets(resolutions, rows_log2), persistent=False)
-        self.table = nn.Parameter(torch.empty(int(self.offsets[-1]), FEATURES).uniform_(-1e-4, 1e-4))
+        self.table = nn.Parameter(torch.empty(int(self.offsets[-1]), FEATURES).uniform_(-_START, _START))
         self.extent = extent
 
     @property
@@ -38,28 +42,21 @@ class HashGrid(nn.Module):
         """Cell size of the finest active level."""
         return 2.0 * self.extent / float(self.resolutions[min(active, len(self.resolutions)) - 1])
 
-    def grow(self, rows_log2: int) -> Tensor:
-        """Give every level up to 2^rows_log2 rows without a change of any value: (T,) the row that each new one is a copy of.
+    def resize(self, first: int, rows_log2: Sequence[int], generator: torch.Generator) -> int:
+        """Give the levels from ``first`` on other numbers of rows: they start anew, the others stay as they are.
 
+        Returns:
+            the number of rows before level ``first``: those that are as they were.
         Raises:
-            ValueError: a level would lose rows.
+            ValueError: a level before ``first`` would change, too.
         """
-        resolutions = self.resolutions.tolist()
-        before, after = self.offsets.tolist(), _offsets(resolutions, rows_log2).tolist()
-        sources = []
-        for level, resolution in enumerate(resolutions):
-            had, has = before[level + 1] - before[level], after[level + 1] - after[level]
-            if has < had:
-                raise ValueError(f"level {level} has {had} rows, cannot grow to {has}")
-            source = torch.arange(has)
-            if had < (resolution + 1) ** 3 <= has:
-                axis = torch.arange(resolution + 1)
-                source = kernels.reference.row_of(torch.cartesian_prod(axis, axis, axis), resolution, had)
-            sources.append(before[level] + source % had)  # the hash of twice as many rows has the same low bits
-        source = torch.cat(sources).to(self.table.device)
-        self.offsets = torch.tensor(after, device=self.offsets.device)
-        self.table.data, self.table.grad = self.table.data[source], None
-        return source
+        kept, offsets = int(self.offsets[first]), _offsets(self.resolutions.tolist(), rows_log2)
+        if not torch.equal(offsets[: first + 1], self.offsets[: first + 1].cpu()):
+            raise ValueError(f"{rows_log2} changes the rows of a level before level {first}")
+        self.offsets = offsets.to(self.offsets.device)
+        fresh = torch.empty(int(self.offsets[-1]) - kept, FEATURES).uniform_(-_START, _START, generator=generator)
+        self.table.data, self.table.grad = torch.cat([self.table.data[:kept], fresh.to(self.table.device)]), None
+        return kept
 
     def place(self, points: Tensor) -> Tensor:
         """Points of the normalised frame in the grid's own: contracted space where it is wider than the region."""
@@ -71,8 +68,9 @@ class HashGrid(nn.Module):
         return kernels.hash_encode(unit, self.table, self.resolutions, self.offsets, active)
 
 
-def _offsets(resolutions: list[int], rows_log2: int) -> Tensor:
-    rows = [min((r + 1) ** 3, 2**rows_log2) for r in resolutions]
+def _offsets(resolutions: list[int], rows_log2: int | Sequence[int]) -> Tensor:
+    most = [rows_log2] * len(resolutions) if isinstance(rows_log2, int) else rows_log2
+    rows = [min((r + 1) ** 3, 2**m) for r, m in zip(resolutions, most, strict=True)]
     return torch.tensor([sum(rows[:i]) for i in range(len(rows) + 1)])
 
 

@@ -70,10 +70,10 @@ class Design:
     """The sizes of a field's parts: what a scene was found to need (see fitting.needs). Stored with the field."""
 
     surface_levels: int = 8
-    surface_rows_log2: int = 16
+    surface_rows_log2: int | tuple[int, ...] = 16
     surface_finest: int = 128
     radiance_levels: int = 10
-    radiance_rows_log2: int = 16
+    radiance_rows_log2: int | tuple[int, ...] = 16
     radiance_finest: int = 256
     background: bool = False
     beyond: bool = False
@@ -140,12 +140,20 @@ class Field(nn.Module):
         pose = frame.camera_to_world @ self.corrections.sensors.get(frame.sensor, np.eye(4))
         return self.corrections.views.get(frame.view, np.eye(4)) @ pose
 
-    def grow_tables(self, surface_rows_log2: int, radiance_rows_log2: int) -> dict[str, Tensor]:
-        """More rows for the hash tables, without a change of the field: by parameter, the row that each new one is a copy of."""
-        self.design = replace(self.design, surface_rows_log2=surface_rows_log2, radiance_rows_log2=radiance_rows_log2)
+    def resize_tables(
+        self, surface: tuple[int, ...], radiance: tuple[int, ...], first: tuple[int, int], generator: torch.Generator
+    ) -> dict[str, int]:
+        """Other numbers of rows for the finer levels of the hash tables, which start anew.
+
+        Args:
+            surface, radiance: log2 of the most rows of each level. first: levels of the two that are the first to be resized.
+        Returns:
+            by parameter, how many of its first rows are as they were.
+        """
+        self.design = replace(self.design, surface_rows_log2=surface, radiance_rows_log2=radiance)
         return {
-            "surface.grid.table": self.surface.grid.grow(surface_rows_log2),
-            "appearance.table": self.appearance.grow(radiance_rows_log2),
+            "surface.grid.table": self.surface.grid.resize(first[0], surface, generator),
+            "appearance.table": self.appearance.resize(first[1], radiance, generator),
         }
 
     def to_normalised(self, points: np.ndarray) -> Tensor:
@@ -311,7 +319,8 @@ class Field(nn.Module):
             region = Region(tuple(stored["region"]["centre"]), stored["region"]["radius"])
             cameras = {n: Camera(**{**c, "distortion": tuple(c["distortion"])}) for n, c in stored["cameras"].items()}
             rig = {n: np.array(m) for n, m in stored["rig"].items()}
-            field = Field(Design(**stored["design"]), sensors, stored["levels"], region, stored["unit"], cameras, rig)
+            sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored["design"].items()}
+            field = Field(Design(**sizes), sensors, stored["levels"], region, stored["unit"], cameras, rig)
             field.sampling = Sampling(**stored["sampling"])
             field.view_dependence = dict(stored["view_dependence"])
             moved = stored["corrections"]

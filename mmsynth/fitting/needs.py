@@ -15,7 +15,6 @@ import numpy as np
 from mmsynth.field.field import Design
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.tables import LEAST
 from mmsynth.scene.scene import Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
@@ -111,10 +110,10 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     evidence["tensor_head"] = f"on: {', '.join(pol)}; costs six outputs each" if pol else "off: no polarization sensor"
     design = Design(
         surface_levels=recipe.surface_levels,
-        surface_rows_log2=recipe.surface_rows_log2 if recipe.tables_at == 0 else min(LEAST, recipe.surface_rows_log2),
+        surface_rows_log2=recipe.surface_rows_log2,
         surface_finest=surface_finest,
         radiance_levels=recipe.radiance_levels,
-        radiance_rows_log2=recipe.radiance_rows_log2 if recipe.tables_at == 0 else min(LEAST, recipe.radiance_rows_log2),
+        radiance_rows_log2=recipe.radiance_rows_log2,
         radiance_finest=radiance_finest,
         background=background,
         beyond=beyond,

@@ -36,10 +36,12 @@ class Adam:
                 first, second = self.moments[name]
                 kernels.adam(p[met], p.grad[met], first[met], second[met], rate, *_BETAS, _EPSILON, self.count)
 
-    def take(self, name: str, rows: torch.Tensor) -> None:
-        """Follow a parameter whose rows became copies of ``rows`` of what it was."""
-        first, second = self.moments[name]
-        self.moments[name] = first[rows], second[rows]
+    def resize(self, name: str, kept: int) -> None:
+        """Follow a parameter that has new rows behind its first ``kept``."""
+        grown = [torch.zeros_like(self.parameters[name]) for _ in range(2)]
+        for new, old in zip(grown, self.moments[name], strict=True):
+            new[:kept] = old[:kept]
+        self.moments[name] = grown[0], grown[1]
 
     def clear(self) -> None:
         """Drop the gradients without a step."""
@@ -75,10 +77,11 @@ class Average:
                 self.means[name] = p.detach().clone()
             self.means[name].lerp_(p, weight)
 
-    def take(self, name: str, rows: torch.Tensor) -> None:
-        """Follow a parameter whose rows became copies of ``rows`` of what it was."""
+    @torch.no_grad()
+    def resize(self, name: str, kept: int) -> None:
+        """Follow a parameter that has new rows behind its first ``kept``."""
         if name in self.means:
-            self.means[name] = self.means[name][rows]
+            self.means[name] = torch.cat([self.means[name][:kept], self.parameters[name][kept:]])
 
     @torch.no_grad()
     def apply(self) -> None:

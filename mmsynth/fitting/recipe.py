@@ -29,7 +29,10 @@ class Recipe(BaseModel):
     radiance_cells: float = Field(4.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
     cells_per_row: float = Field(3.0, gt=0, description="cells of the finest level at the surface that share a row of its hash table")
     tables_at: float = Field(
-        0.1, ge=0, le=0.5, description="progress at which these cells are counted and the tables get their rows; 0: the most from the start"
+        0.05,
+        ge=0,
+        lt=1,
+        description="progress at which these cells are counted, for the levels that are not yet active; 0: all have the most",
     )
     measurements_per_cell: float = Field(
         10.0, gt=0, description="rays that must see a cell of the finest surface grid, on the average; fewer: coarser and softer"

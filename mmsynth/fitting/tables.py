@@ -1,4 +1,4 @@
-"""How many rows the hash tables need: counted once the surface has taken shape."""
+"""How many rows the finer levels of the hash tables need: counted when the surface takes shape, before these levels are used."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
 
-LEAST = 13  # log2 of the rows that a level has before anything is counted: a grid 16 cells across is dense
+_LEAST = 12
 _PROBES = 65536
 _CROSSED = 0.75  # of a cell's size: mean distance within which a plane crosses a cube, (|n_x| + |n_y| + |n_z|) / 2 over all n
 
@@ -34,5 +34,5 @@ def cells_at_surface(field: Field, active: int, generator: torch.Generator) -> t
 
 
 def rows_log2(cells: float, cells_per_row: float, most: int) -> int:
-    """log2 of a level's rows: the nearest power of two, at least what it began with, at most 2^most."""
-    return min(most, max(LEAST, round(math.log2(max(cells / cells_per_row, 1.0)))))
+    """log2 of a level's rows: the nearest power of two, at least 2^12, at most 2^most."""
+    return min(most, max(_LEAST, round(math.log2(max(cells / cells_per_row, 1.0)))))

@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -216,22 +216,27 @@ class Trainer:
         return torch.from_numpy(np.repeat([values[n] for n in batch.parts], counts)).to(self.device)
 
     def _size_tables(self, sampling: rendering.Sampling, generator: torch.Generator) -> None:
-        """Give the hash tables rows for the cells at the surface, as it is now."""
-        recipe, needs = self.recipe, self.needs
+        """Give the levels of the hash tables that are not yet active rows for the cells at the surface, as it is now."""
+        recipe = self.recipe
         cells = cells_at_surface(self.field, sampling.active_surface, generator)
-        most = recipe.surface_rows_log2, recipe.radiance_rows_log2
-        rows = [rows_log2(n, recipe.cells_per_row, m) for n, m in zip(cells, most, strict=True)]
-        needs.evidence["tables"] = ", ".join(
-            f"{name} 2^{r} rows a level for {n:.2g} cells at the surface{' (the most)' if r == m else ''}"
-            for name, n, r, m in zip(("surface", "radiance"), cells, rows, most, strict=True)
-        )
-        self._grow_tables(rows)
-        self.state.tables = {"rows_log2": rows, "evidence": needs.evidence["tables"]}
+        rows = [rows_log2(cells[0], recipe.cells_per_row, recipe.surface_rows_log2)]
+        rows += [rows_log2(cells[1], recipe.cells_per_row, recipe.radiance_rows_log2)]
+        evidence = ", ".join(f"{what} 2^{r} for {n:.2g} cells" for what, r, n in zip(("surface", "radiance"), rows, cells, strict=True))
+        self.state.tables = {
+            "surface": [recipe.surface_rows_log2] * sampling.active_surface + [rows[0]] * (recipe.surface_levels - sampling.active_surface),
+            "radiance": [recipe.radiance_rows_log2] * sampling.active_radiance
+            + [rows[1]] * (recipe.radiance_levels - sampling.active_radiance),
+            "first": [sampling.active_surface, sampling.active_radiance],
+            "evidence": f"rows for each of the finer levels, cells of the finest at the surface: {evidence}",
+        }
+        self._resize_tables(self.state.tables, generator)
 
-    def _grow_tables(self, rows: Sequence[int]) -> None:
-        for name, sources in self.field.grow_tables(*rows).items():
-            self.optimiser.take(name, sources)
-            self.average.take(name, sources)
+    def _resize_tables(self, sizes: dict[str, Any], generator: torch.Generator) -> None:
+        kept = self.field.resize_tables(tuple(sizes["surface"]), tuple(sizes["radiance"]), tuple(sizes["first"]), generator)
+        for name, rows in kept.items():
+            self.optimiser.resize(name, rows)
+            self.average.resize(name, rows)
+        self.needs.evidence["tables"] = sizes["evidence"]
 
     @torch.no_grad()
     def _decide(self, sampling: rendering.Sampling) -> None:
@@ -341,8 +346,7 @@ class Trainer:
                 )
         self.state = _State(**saved["state"])
         if self.state.tables is not None:
-            self._grow_tables(self.state.tables["rows_log2"])
-            self.needs.evidence["tables"] = self.state.tables["evidence"]
+            self._resize_tables(self.state.tables, torch.Generator())  # what is new is read from the checkpoint
         self.field.load_state_dict(saved["field"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.log_gain.data.copy_(saved["log_gain"])

@@ -70,25 +70,24 @@ def test_rows_that_were_never_met_need_no_step(met: int) -> None:
         torch.testing.assert_close(part[name], p, atol=1e-6, rtol=0)
 
 
-def test_an_optimiser_and_a_mean_follow_rows_that_are_copied() -> None:
+@pytest.mark.parametrize("size", [30, 50, 80])
+def test_an_optimiser_and_a_mean_follow_a_table_of_another_size(size: int) -> None:
     parameters = _parameters()
     optimiser, average = Adam(parameters, dict.fromkeys(parameters, 0.1)), Average(parameters)
     _gradients(parameters, 0)
     optimiser.step(1.0)
     average.update(4.0)
-    moments, mean = [m.clone() for m in optimiser.moments["a.table"]], average.means["a.table"].clone()
-    source = torch.arange(120) % 50
-    table = parameters["a.table"]
-    table.data, table.grad = table.data[source], None
-    optimiser.take("a.table", source)
-    average.take("a.table", source)
-    average.take("b", torch.arange(7))
-    assert all(torch.equal(m, old[source]) for m, old in zip(optimiser.moments["a.table"], moments, strict=True))
-    assert torch.equal(average.means["a.table"], mean[source])
-    _gradients(parameters, 1)
+    moments, mean, table = [m.clone() for m in optimiser.moments["a.table"]], average.means["a.table"].clone(), parameters["a.table"]
+    table.data, table.grad = torch.cat([table.data[:20], torch.ones(size - 20, 4)]), None
+    optimiser.resize("a.table", 20)
+    average.resize("a.table", 20)
+    for new, old in zip(optimiser.moments["a.table"], moments, strict=True):
+        assert torch.equal(new[:20], old[:20]) and new.shape == (size, 4) and not new[20:].any()
+    assert torch.equal(average.means["a.table"][:20], mean[:20]) and (average.means["a.table"][20:] == 1).all()
+    parameters["b"].grad, table.grad = None, torch.ones(size, 4)
     optimiser.step(1.0)
     average.update(4.0)
-    assert table.shape == average.means["a.table"].shape == (120, 4)
+    assert table.shape == average.means["a.table"].shape == (size, 4)
 
 
 def test_cleared_gradients_change_nothing() -> None:

@@ -1,6 +1,5 @@
 """Hash tables get the rows that the surface asks for, in the middle of a fit, and nothing else changes."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,8 @@ from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Design, Field
 from mmsynth.fitting import trainer as trainer_module
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.tables import LEAST, cells_at_surface, rows_log2
+from mmsynth.fitting.schedule import sampling_at
+from mmsynth.fitting.tables import cells_at_surface, rows_log2
 from mmsynth.fitting.trainer import Trainer, fit
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region, Scene, Sensor
@@ -23,7 +23,8 @@ from mmsynth.scene.scene import Region, Scene, Sensor
 SMALL: dict[str, Any] = {
     "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "radiance_levels": 4, "occupancy_resolution": 24,
     "occupancy_every": 4, "eikonal_points": 64, "radiance_hidden": 32, "surface_rows_log2": 16, "radiance_rows_log2": 17,
-    "radiance_cells": 60.0, "cells_per_row": 2.0, "tables_at": 0.25, "poses": "off", "rig": "off", "average": 0.25, "view_dependence": 1,
+    "radiance_cells": 60.0, "cells_per_row": 2.0, "tables_at": 0.125, "levels_until": 0.5, "poses": "off", "rig": "off", "average": 0.25,
+    "view_dependence": 1,
     "exposure": "off",
 }  # fmt: skip
 
@@ -59,53 +60,54 @@ def test_the_count_is_that_of_cells_with_corners_on_both_sides(radius: float) ->
     assert radiance == pytest.approx(_crossed(radius, 160), rel=0.05)
 
 
-def test_rows_stay_within_what_a_table_began_with_and_the_recipe_allows() -> None:
+def test_rows_stay_within_what_is_sensible_and_the_recipe_allows() -> None:
     assert rows_log2(2.0**15 * 3, 3.0, 19) == 15
     assert rows_log2(2.0**15 * 3 * 1.4, 3.0, 19) == 15 and rows_log2(2.0**15 * 3 * 1.5, 3.0, 19) == 16  # the nearest
-    assert rows_log2(0.0, 3.0, 19) == LEAST and rows_log2(1e12, 3.0, 19) == 19
-    assert rows_log2(1e12, 3.0, 9) == rows_log2(0.0, 3.0, 9) == 9  # a recipe may ask for less than the least
+    assert rows_log2(0.0, 3.0, 19) == 12 and rows_log2(1e12, 3.0, 19) == 19
+    assert rows_log2(1e12, 3.0, 9) == rows_log2(0.0, 3.0, 9) == 9  # a recipe may ask for less
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    levels=st.integers(1, 5), few=st.integers(6, 12), more=st.integers(0, 6), coarsest=st.integers(2, 12), finer=st.integers(1, 6),
-    seed=st.integers(0, 99),
-)  # fmt: skip
-def test_growing_changes_no_value(levels: int, few: int, more: int, coarsest: int, finer: int, seed: int) -> None:
-    """Hashed levels that stay hashed, that become dense, and that were dense."""
-    torch.manual_seed(seed)
-    grid = HashGrid(levels, few, coarsest, coarsest * finer)
+@given(levels=st.integers(1, 5), share=st.floats(0, 1), before=st.integers(6, 12), after=st.integers(6, 12), finer=st.integers(1, 6))
+def test_other_rows_for_finer_levels_leave_the_coarser_as_they_are(levels: int, share: float, before: int, after: int, finer: int) -> None:
+    first = round(share * levels)
+    grid = HashGrid(levels, before, 4, 4 * finer)
     grid.table.data.normal_()
     x = torch.rand(200, 3) * 2 - 1
-    before, table, old = grid(x, levels).detach(), grid.table, grid.table.detach().clone()
-    source = grid.grow(few + more)
-    assert grid.table is table and torch.equal(grid.table.detach(), old[source])
-    assert torch.equal(grid(x, levels).detach(), before)
-    expected = HashGrid(levels, few + more, coarsest, coarsest * finer)
+    values, table = grid(x, first).detach(), grid.table
+    rows = [before] * first + [after] * (levels - first)
+    kept = grid.resize(first, rows, torch.Generator().manual_seed(0))
+    assert grid.table is table and torch.equal(grid(x, first).detach(), values)
+    assert grid.table[kept:].abs().max() <= 1e-4 if first < levels else kept == len(grid.table)
+    expected = HashGrid(levels, rows, 4, 4 * finer)
     assert torch.equal(grid.offsets, expected.offsets) and grid.table.shape == expected.table.shape
 
 
-def test_a_table_does_not_shrink() -> None:
-    with pytest.raises(ValueError, match="cannot grow"):
-        HashGrid(2, 12, 16, 64).grow(11)
+def test_levels_in_use_keep_their_rows() -> None:
+    with pytest.raises(ValueError, match="before level 2"):
+        HashGrid(3, 10, 16, 64).resize(2, [12, 10, 9], torch.Generator())
 
 
-def test_a_fit_sizes_its_tables_once_and_says_so(scene: Scene) -> None:
+def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
     trainer = Trainer(scene, Recipe.model_validate(SMALL), 16, None, 0, "cpu")
-    assert trainer.field.design.surface_rows_log2 == trainer.field.design.radiance_rows_log2 == LEAST
+    assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
     assert "tables" not in trainer.needs.evidence
-    while trainer.progress < 0.25:
+    while trainer.progress < 0.125:
         trainer.run_step()
-    before = trainer.field.surface.grid.table.detach().clone()
-    trainer.run_step()
+    coarse = int(trainer.field.appearance.offsets[2])
+    before, moments = trainer.field.appearance.table.detach().clone(), trainer.optimiser.moments["appearance.table"][0].clone()
+    trainer._size_tables(sampling_at(trainer.progress, trainer.recipe, trainer.needs), torch.Generator().manual_seed(0))
     design, evidence = trainer.field.design, trainer.needs.evidence["tables"]
-    assert LEAST < design.radiance_rows_log2 <= 17 and f"radiance 2^{design.radiance_rows_log2} rows" in evidence
-    assert len(trainer.field.appearance.table) == int(trainer.field.appearance.offsets[-1])
-    for name, moments in trainer.optimiser.moments.items():
-        assert all(m.shape == trainer.optimiser.parameters[name].shape for m in moments)
+    assert isinstance(design.radiance_rows_log2, tuple) and design.radiance_rows_log2[:2] == (17, 17)
+    fine = design.radiance_rows_log2[-1]
+    assert 12 <= fine < 17 and f"radiance 2^{fine} for" in evidence
+    table = trainer.field.appearance.table
+    assert torch.equal(table[:coarse], before[:coarse]) and len(table) == int(trainer.field.appearance.offsets[-1]) < len(before)
+    assert torch.equal(trainer.optimiser.moments["appearance.table"][0][:coarse], moments[:coarse]) and moments[:coarse].any()
     while trainer.progress < 1:
         trainer.run_step()
-    assert trainer.field.design == design and not torch.equal(trainer.field.surface.grid.table[: len(before)], before)
+    assert trainer.field.design == design and not torch.equal(trainer.field.appearance.table[:coarse], before[:coarse])
+    assert trainer.optimiser.moments["appearance.table"][1][coarse:].any()  # the finer levels learn
     assert trainer.state.bad_steps == 0
 
 
@@ -117,7 +119,7 @@ def test_a_small_object_gets_smaller_tables_than_a_large_one(scene: Scene) -> No
         while trainer.state.tables is None:
             trainer.run_step()
         rows[radius] = trainer.field.design
-    assert rows[0.1].radiance_rows_log2 < rows[0.6].radiance_rows_log2
+    assert rows[0.1].radiance_rows_log2[-1] < rows[0.6].radiance_rows_log2[-1]
 
 
 def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
@@ -149,4 +151,4 @@ def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
     for name, value in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], value), name
     loaded = Field.load(tmp_path / "cut")
-    assert loaded.design == replace(whole.design) and torch.equal(loaded.surface.grid.table, whole.surface.grid.table)
+    assert loaded.design == whole.design and torch.equal(loaded.surface.grid.table, whole.surface.grid.table)

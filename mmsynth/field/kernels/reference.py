@@ -44,18 +44,14 @@ def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: 
         base = scaled.floor().clamp(0, resolution - 1)
         fraction = (scaled - base)[:, None]
         cell = base.long()[:, None] + corners
-        index = row_of(cell, resolution, len(rows))
+        if (resolution + 1) ** 3 <= len(rows):
+            index = (cell[..., 0] * (resolution + 1) + cell[..., 1]) * (resolution + 1) + cell[..., 2]
+        else:
+            index = (cell[..., 0] * PRIMES[0]) ^ (cell[..., 1] * PRIMES[1]) ^ (cell[..., 2] * PRIMES[2])
+            index = index & (len(rows) - 1)
         weight = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
         out[:, level] = (rows[index] * weight[..., None]).sum(1)
     return out.reshape(positions.shape[0], levels * features)
-
-
-def row_of(corner: Tensor, resolution: int, rows: int) -> Tensor:
-    """Row of a level's corners, (..., 3) int64 in 0..resolution → (...): dense where all corners have one, else hashed."""
-    if (resolution + 1) ** 3 <= rows:
-        return (corner[..., 0] * (resolution + 1) + corner[..., 1]) * (resolution + 1) + corner[..., 2]
-    index = (corner[..., 0] * PRIMES[0]) ^ (corner[..., 1] * PRIMES[1]) ^ (corner[..., 2] * PRIMES[2])
-    return index & (rows - 1)
 
 
 def contract(positions: Tensor) -> Tensor:
