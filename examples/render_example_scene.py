@@ -31,6 +31,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 import trimesh
 from skimage.measure import marching_cubes
 
@@ -641,7 +642,7 @@ def photosites(sensor: RigSensor, stokes: np.ndarray) -> np.ndarray:
     """Stokes (H, W, 3) rendered with each photosite's own response → the light each photosite measures (H, W)."""
     if not sensor.polarized:
         return stokes[..., 0]
-    intensities = stokes_to_intensities(stokes, POLARIZER_DEG)
+    intensities = stokes_to_intensities(torch.from_numpy(stokes), POLARIZER_DEG).numpy()
     return np.take_along_axis(intensities, channel_map(sensor.pattern, *stokes.shape[:2])[..., None], 2)[..., 0]
 
 

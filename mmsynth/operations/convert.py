@@ -36,6 +36,7 @@ def camera_json(camera: Camera, camera_to_world: np.ndarray) -> dict[str, Any]:
         "fy": camera.fy,
         "cx": camera.cx,
         "cy": camera.cy,
+        "lens": camera.lens,
         "distortion": list(camera.distortion),
         "camera_to_world": np.asarray(camera_to_world, dtype=np.float64).tolist(),
     }
@@ -181,7 +182,8 @@ def convert_views(
 CONVENTIONS = {
     "camera_axes": "OpenCV: x right, y down, z forward; camera_to_world 4x4",
     "pixels": "centre of the top-left pixel is (0, 0)",
-    "distortion": "OpenCV order k1 k2 p1 p2 k3 k4 k5 k6, undistorted to distorted; images are distorted, as the lens sees",
+    "distortion": "OpenCV's: lens brown_conrady k1 k2 p1 p2 k3 k4 k5 k6, kannala_brandt (fisheye) k1 k2 k3 k4, undistorted to distorted; "
+    "images are distorted, as the lens sees",
     "radiance": "linear float32, 1.0 = full scale of the sensor; NaN where the lens has no ray",
     "polarization": "S0 S1 S2 about the camera x axis; angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
     "depth": "depth_z along the optical axis, depth_ray along the ray; NaN = no hit",

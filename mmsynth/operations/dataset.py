@@ -254,8 +254,10 @@ def _transforms(cameras: Sequence[tuple[Camera, np.ndarray]], picture: str) -> d
     """nerfstudio's transforms.json: OpenGL axes, centre of the top-left pixel at (0.5, 0.5)."""
     frames = []
     for index, (camera, pose) in enumerate(cameras):
-        coefficients = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), map(float, camera.coefficients), strict=True))
+        fisheye = camera.lens == "kannala_brandt"
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         frames.append({
+            "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
             "file_path": f"views/{index:04d}/{picture}",
             "w": camera.width,
             "h": camera.height,
@@ -263,10 +265,10 @@ def _transforms(cameras: Sequence[tuple[Camera, np.ndarray]], picture: str) -> d
             "fl_y": camera.fy,
             "cx": camera.cx + 0.5,
             "cy": camera.cy + 0.5,
-            **coefficients,
+            **dict(zip(names, map(float, camera.coefficients), strict=True)),
             "transform_matrix": (np.asarray(pose) @ OPENGL_TO_OPENCV).tolist(),
         })  # fmt: skip
-    return {"camera_model": "OPENCV", "frames": frames}
+    return {"camera_model": frames[0]["camera_model"] if frames else "OPENCV", "frames": frames}
 
 
 def _finished(folder: Path, key: str) -> dict[str, Any] | None:

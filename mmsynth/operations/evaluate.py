@@ -29,6 +29,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 from skimage.metrics import structural_similarity
 
@@ -38,7 +39,7 @@ from mmsynth.scene.images import load_frame, read_native
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.mosaic import mosaic
-from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_error, degree_of_linear_polarization, stokes_to_intensities
+from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
@@ -190,7 +191,7 @@ def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Renderi
     if alpha is not None:
         # what is transparent was never seen
         measured = measured * alpha[..., None]
-    predicted = channels if sensor.mosaic is None else mosaic(channels, sensor.mosaic)
+    predicted = channels if sensor.mosaic is None else mosaic(torch.from_numpy(channels).movedim(-1, 0), sensor.mosaic).numpy()
     squared = (predicted - measured) ** 2
     drawn = _mask(frame)
     if drawn is None and alpha is not None:
@@ -206,7 +207,7 @@ def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Renderi
 def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """All channels against noise-free light; truth (H, W, C), of a polarization sensor Stokes (H, W, 3)."""
     if sensor.polarizer_angles_deg is not None:
-        truth = stokes_to_intensities(truth, sensor.polarizer_angles_deg)
+        truth = stokes_to_intensities(torch.from_numpy(truth), sensor.polarizer_angles_deg).numpy()
     difference = np.clip(rendering.channels[sensor.name], 0.0, 1.0) - np.clip(truth, 0.0, 1.0)
     scores.add(key, difference[where & rendering.valid] ** 2)
 
@@ -215,11 +216,11 @@ def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: n
     """What PSNR does not say: the spectrum's shape, the polarization state."""
     where = where & rendering.valid
     if sensor.is_polarization:
-        ours, truth = rendering.stokes[sensor.name][where].astype(np.float64), truth[where].astype(np.float64)
-        scores.add("stokes_rmse", (ours - truth) ** 2)
-        scores.add("dolp_rmse", (degree_of_linear_polarization(ours) - degree_of_linear_polarization(truth)) ** 2)
-        error = aolp_error(angle_of_linear_polarization(ours), angle_of_linear_polarization(truth))
-        scores.add("aolp_mae", error, np.hypot(truth[:, 1], truth[:, 2]))
+        ours, real = (torch.from_numpy(s[where].astype(np.float64)) for s in (rendering.stokes[sensor.name], truth))
+        scores.add("stokes_rmse", ((ours - real) ** 2).numpy())
+        scores.add("dolp_rmse", ((degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)) ** 2).numpy())
+        error = aolp_difference(angle_of_linear_polarization(ours), angle_of_linear_polarization(real)).abs()
+        scores.add("aolp_mae", error.numpy(), real[:, 1:].norm(dim=1).numpy())
     elif sensor.channel_count > 3:
         scores.add("sam", spectral_angle_deg(rendering.channels[sensor.name][where], truth[where]))
 

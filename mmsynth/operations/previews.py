@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from mmsynth.files import write_atomic
 from mmsynth.scene.scene import Sensor
@@ -72,7 +73,7 @@ def preview_rgb(sensor: Sensor, channels: np.ndarray, exposure: float | None = N
 
 def preview_dolp(stokes: np.ndarray) -> np.ndarray:
     """Stokes (H, W, 3) → (H, W) float32, DoLP in [0, 1]; 0 where there is no light or no ray."""
-    return np.clip(degree_of_linear_polarization(np.nan_to_num(stokes)), 0.0, 1.0).astype(np.float32)
+    return degree_of_linear_polarization(torch.from_numpy(np.nan_to_num(stokes))).clamp(0.0, 1.0).float().numpy()
 
 
 def preview_aolp(stokes: np.ndarray) -> np.ndarray:
@@ -82,7 +83,7 @@ def preview_aolp(stokes: np.ndarray) -> np.ndarray:
     has no angle and is black.
     """
     stokes = np.nan_to_num(stokes).astype(np.float64)
-    hue = (2.0 * angle_of_linear_polarization(stokes)) % 360.0
+    hue = (2.0 * angle_of_linear_polarization(torch.from_numpy(stokes)).numpy()) % 360.0
     hsv = np.stack([hue, np.ones_like(hue), preview_dolp(stokes)], -1).astype(np.float32)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
 

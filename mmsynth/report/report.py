@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
+import torch
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
@@ -126,7 +127,7 @@ def _source(image: np.ndarray) -> str:
 def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
     """A frame with all channels at every pixel (H, W, C), demosaicked for display."""
     pixels, _ = load_frame(sensor, frame)
-    return pixels if sensor.mosaic is None else demosaic(pixels, sensor.mosaic)
+    return pixels if sensor.mosaic is None else demosaic(torch.from_numpy(pixels), sensor.mosaic).movedim(0, -1).numpy()
 
 
 def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tuple[str, np.ndarray]]]]:
@@ -157,7 +158,7 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tupl
                 ("difference x 5", previews.to_uint8(5.0 * difference)),
             ]
             if sensor.polarizer_angles_deg is not None:
-                stokes = intensities_to_stokes(measured, sensor.polarizer_angles_deg)
+                stokes = intensities_to_stokes(torch.from_numpy(measured), sensor.polarizer_angles_deg).numpy()
                 row += [("AoLP (hue), DoLP (value): frame", previews.to_uint8(previews.preview_aolp(stokes)))]
                 row += [("rendering", previews.to_uint8(previews.preview_aolp(rendering.stokes[name])))]
             if first:

@@ -17,7 +17,7 @@ from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.images import read_native
 from mmsynth.scene.scene import Region
-from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.camera import Camera, Lens
 
 Pose = tuple[Camera | None, np.ndarray, str]
 """camera (None where the file has no intrinsics), camera_to_world (4, 4), name."""
@@ -158,7 +158,10 @@ def _triple(point: np.ndarray) -> tuple[float, float, float]:
 
 # --- nerfstudio's transforms.json ------------------------------------------------------------------------------------
 
+_BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE = ("k1", "k2", "k3", "k4")
 _BROWN_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE_MODEL = "OPENCV_FISHEYE"
 
 
 def transforms_camera(
@@ -166,21 +169,22 @@ def transforms_camera(
 ) -> Camera | None:
     """Intrinsics of one frame of transforms.json; a key of the frame wins over the shared one.
 
-    Distortion k1..k6, p1, p2 is read as OpenCV's rational Brown model. Keys that are missing: cx, cy = image centre,
-    fl_y = fl_x, and fl_x, fl_y from camera_angle_x, camera_angle_y [rad].
+    Distortion k1..k6, p1, p2 is read as OpenCV's rational Brown model, k1..k4 of an ``OPENCV_FISHEYE`` (or ``is_fisheye``) as
+    Kannala-Brandt's. Keys that are missing: coefficients = 0, cx, cy = image centre, fl_y = fl_x, and fl_x, fl_y from
+    camera_angle_x, camera_angle_y [rad].
 
     Args:
         size: width, height of the image for files without w and h.
     Returns:
         None when there is neither a focal length nor an angle, or no size.
     Raises:
-        InputError: bad number, or a lens model other than Brown's.
+        InputError: bad number, or another lens model.
     """
     merged = {**shared, **frame}
     model = str(merged.get("camera_model", "OPENCV")).upper()
-    if model not in _BROWN_MODELS or merged.get("is_fisheye"):
-        model = "OPENCV_FISHEYE" if model in _BROWN_MODELS else model
-        raise InputError(f"{where}: camera_model {model} is not supported yet, expected one of {' '.join(_BROWN_MODELS)}.")
+    fisheye = model == _FISHEYE_MODEL or (model in _BROWN_MODELS and bool(merged.get("is_fisheye")))
+    if model not in _BROWN_MODELS and not fisheye:
+        raise InputError(f"{where}: camera_model {model} is not supported, expected one of {' '.join((*_BROWN_MODELS, _FISHEYE_MODEL))}.")
     if "w" in merged and "h" in merged:
         size = whole(merged, "w", where), whole(merged, "h", where)
     if size is None:
@@ -194,9 +198,8 @@ def transforms_camera(
         return None
     cx = number(merged, "cx", where) if "cx" in merged else width / 2
     cy = number(merged, "cy", where) if "cy" in merged else height / 2
-    order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    distortion = tuple(number(merged, key, where) if key in merged else 0.0 for key in order)
-    return make_camera(where, width, height, fx, fy, cx - 0.5, cy - 0.5, distortion)
+    distortion = [number(merged, key, where) if key in merged else 0.0 for key in (_FISHEYE if fisheye else _BROWN)]
+    return make_camera(where, width, height, fx, fy, cx - 0.5, cy - 0.5, distortion, fisheye)
 
 
 def _focal(entry: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
@@ -210,10 +213,13 @@ def _focal(entry: Mapping[str, Any], axis: str, pixels: int, where: str) -> floa
     return None
 
 
-def make_camera(where: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float]) -> Camera:
+def make_camera(
+    where: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float], fisheye: bool = False
+) -> Camera:
     """A Camera whose errors name the file; no coefficients when all are zero, so that equal cameras compare equal."""
     try:
-        return Camera(width, height, fx, fy, cx, cy, tuple(distortion) if any(distortion) else ())
+        lens: Lens = "kannala_brandt" if fisheye else "brown_conrady"
+        return Camera(width, height, fx, fy, cx, cy, tuple(distortion) if any(distortion) else (), lens)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
@@ -318,6 +324,7 @@ _COLMAP_MODELS = {
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    _FISHEYE_MODEL: "fx fy cx cy k1 k2 k3 k4",
 }
 
 
@@ -374,9 +381,10 @@ def _colmap_cameras(path: Path) -> dict[int, Camera] | None:
             value = dict(zip(names, map(float, tokens[4:]), strict=True))
         except ValueError as error:
             raise InputError(f"{where}: expected {len(names)} numbers ({' '.join(names)}) after the size.") from error
-        distortion = [value.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+        fisheye = tokens[1] == _FISHEYE_MODEL
+        distortion = [value.get(key, 0.0) for key in (_FISHEYE if fisheye else _BROWN)]
         fx, fy = value.get("fx", value.get("f", 0.0)), value.get("fy", value.get("f", 0.0))
-        out[identity] = make_camera(where, width, height, fx, fy, value["cx"] - 0.5, value["cy"] - 0.5, distortion)
+        out[identity] = make_camera(where, width, height, fx, fy, value["cx"] - 0.5, value["cy"] - 0.5, distortion, fisheye)
     return out
 
 

@@ -1,30 +1,36 @@
-"""Pinhole camera with Brown-Conrady lens: pixels to rays and back.
+"""Cameras: intrinsics and a lens (see ``lenses``), from points to pixels and from pixels to rays.
 
-Symbols: ``u, v`` pixel coordinates (column, row; centre of the top-left pixel = 0, 0); ``x, y`` normalised image
-coordinates after the lens (distorted) or before it (ideal). Distortion in OpenCV order k1, k2, p1, p2, k3, k4, k5, k6:
-
-    radial = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
-    x_d = x radial + 2 p1 x y + p2 (r² + 2 x²)
-    y_d = y radial + p1 (r² + 2 y²) + 2 p2 x y
-
-The inverse is a Newton iteration started on the monotone branch of the radial polynomial and checked by its residual:
-OpenCV's and kornia's default five fixed-point iterations do not converge for strong lenses, and beyond the fold of the
-polynomial no ray exists at all. Such pixels are masked, never guessed.
+Pixel coordinates u, v are column and row; the centre of the top-left pixel is (0, 0). ``project_points`` and
+``unproject_points`` are batched torch functions, differentiable in every argument (a pose is refined through its points);
+``project``, ``unproject`` and ``ray_map`` are the same for one ``Camera`` and NumPy arrays, in float64.
 """
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from mmsynth.errors import InputError
+from mmsynth.sensors import lenses
+
+Lens = Literal["brown_conrady", "kannala_brandt"]
+COEFFICIENTS: dict[str, int] = {"brown_conrady": 8, "kannala_brandt": 4}
+_ON_AXIS = 1e-4  # tan θ below which a fisheye's r_d / r is taken from its series: the next term is 1e-16
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics [px] and Brown-Conrady distortion (0, 4, 5 or 8 coefficients, OpenCV order). Hashable."""
+    """Intrinsics [px] and lens. Hashable.
+
+    Attributes:
+        distortion: Brown-Conrady: 0, 4, 5, 6 or 8 coefficients in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6; Kannala-Brandt: 4, k1 to k4.
+        lens: which of the two. Without coefficients ``brown_conrady`` is a pinhole, ``kannala_brandt`` an equidistant fisheye.
+    """
 
     width: int
     height: int
@@ -33,9 +39,14 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    lens: Lens = "brown_conrady"
 
     def __post_init__(self) -> None:
-        if len(self.distortion) not in (0, 4, 5, 6, 8):
+        if self.lens not in COEFFICIENTS:
+            raise InputError(f"camera: lens {self.lens!r}, expected one of {', '.join(COEFFICIENTS)}.")
+        if self.lens == "kannala_brandt" and len(self.distortion) not in (0, 4):
+            raise InputError(f"distortion: {len(self.distortion)} coefficients, expected 4 of a fisheye: k1 k2 k3 k4.")
+        if self.lens == "brown_conrady" and len(self.distortion) not in (0, 4, 5, 6, 8):
             raise InputError(
                 f"distortion: {len(self.distortion)} coefficients, expected 0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6."
             )
@@ -54,104 +65,90 @@ class Camera:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """(8,) distortion, zero-padded."""
-        return np.array(self.distortion + (0.0,) * (8 - len(self.distortion)))
+        """(8,) or, of a fisheye, (4,) distortion, zero-padded."""
+        return np.array(self.distortion + (0.0,) * (COEFFICIENTS[self.lens] - len(self.distortion)))
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """(4,) fx, fy, cx, cy."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
 
 
-def _radial(coefficients: np.ndarray, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radial factor and its derivative with respect to r²."""
-    k1, k2, _, _, k3, k4, k5, k6 = coefficients
-    top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    d_top = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    d_bottom = k4 + r2 * (2 * k5 + r2 * 3 * k6)
-    return top / bottom, (d_top * bottom - top * d_bottom) / bottom**2
-
-
-def distort(xy: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ideal → distorted normalised coordinates.
+def project_points(points: Tensor, intrinsics: Tensor, coefficients: Tensor, lens: Lens = "brown_conrady") -> tuple[Tensor, Tensor]:
+    """Points in front of cameras → pixels.
 
     Args:
-        xy: (..., 2). coefficients: (8,).
+        points: (..., N, 3) in the camera's axes. intrinsics: (..., 4) fx, fy, cx, cy [px].
+        coefficients: (..., 8), or (..., 4) of a fisheye.
     Returns:
-        distorted (..., 2) and Jacobian (..., 2, 2), d distorted[i] / d ideal[j].
+        (..., N, 2) pixels and (..., N) bool: whether the lens sees the point, on the near side of its fold. Pixels of others are finite
+        and mean nothing.
     """
-    _, _, p1, p2, *_ = coefficients
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial, slope = _radial(coefficients, r2)
-    out = np.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
-    jacobian = np.empty((*xy.shape, 2))
-    jacobian[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    jacobian[..., 0, 1] = jacobian[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    jacobian[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return out, jacobian
+    x, y, z = points.unbind(-1)
+    if lens == "kannala_brandt":
+        across = x * x + y * y
+        far = across > (_ON_AXIS * z) ** 2  # from the axis, also where z < 0
+        radius = torch.sqrt(torch.where(far, across, 1.0))
+        angle = torch.atan2(torch.where(far, radius, 0.0), torch.where(far, z, 1.0))
+        ahead = torch.where((z > 0) & ~far, z, 1.0)
+        tangent2 = across / ahead**2
+        near = (1.0 + tangent2 * (coefficients[..., None, 0] - 1.0 / 3.0)) / ahead
+        scale = torch.where(far, lenses.fisheye_radius(angle, coefficients) / radius, near)
+        distorted = points[..., :2] * scale[..., None]
+        valid = torch.where(far, angle <= lenses.fisheye_fold(coefficients)[..., None], z > 0)
+    else:
+        valid = z > 0
+        ideal = points[..., :2] / torch.where(valid, z, 1.0)[..., None]
+        valid = valid & (torch.linalg.vector_norm(ideal.detach(), dim=-1) <= lenses.fold_radius(coefficients)[..., None])
+        # far behind the fold the polynomial overflows, and its gradient with it
+        ideal = torch.where(valid[..., None], ideal, 0.0)
+        distorted = lenses.distort(ideal, coefficients)
+    return distorted * intrinsics[..., None, :2] + intrinsics[..., None, 2:], valid
 
 
-@functools.lru_cache(maxsize=256)
-def fold_radius(distortion: tuple[float, ...]) -> float:
-    """Ideal radius at which the radial polynomial stops growing (inf: never, up to 80 degrees off axis).
-
-    Beyond it two ideal points share a distorted one, so the lens model has no inverse there.
-    """
-    coefficients = np.array(distortion + (0.0,) * (8 - len(distortion)))
-    r = np.linspace(0.0, np.tan(np.radians(80.0)), 20001)
-    radial, slope = _radial(coefficients, r * r)
-    falling = np.flatnonzero(radial + 2 * r * r * slope <= 0)
-    return float(r[falling[0] - 1]) if falling.size else float("inf")
-
-
-def undistort(xy_distorted: np.ndarray, coefficients: np.ndarray, tolerance: float = 1e-10) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted → ideal normalised coordinates, with a validity mask.
-
-    The start is the inverse of the monotone radial profile (tabulated), so Newton begins on the right branch.
+def unproject_points(pixels: Tensor, intrinsics: Tensor, coefficients: Tensor, lens: Lens = "brown_conrady") -> tuple[Tensor, Tensor]:
+    """Pixels → unit directions in the camera's axes, the inverse of ``project_points``.
 
     Args:
-        xy_distorted: (..., 2) float64.
+        pixels: (..., N, 2). intrinsics: (..., 4). coefficients: (..., 8), or (..., 4) of a fisheye.
     Returns:
-        ideal (..., 2) and valid (...) bool: residual below ``tolerance``, inside the fold, orientation kept.
+        (..., N, 3) unit directions and (..., N) bool: whether the lens has a ray there; directions of others point along the axis.
     """
-    target = np.asarray(xy_distorted, dtype=np.float64)
-    if not np.any(coefficients):
-        return target.copy(), np.asarray(np.isfinite(target).all(-1))
-    limit = min(fold_radius(tuple(coefficients)), np.tan(np.radians(80.0)))
-    radii = np.linspace(0.0, limit, 4097)
-    profile = radii * _radial(coefficients, radii * radii)[0]
-    r_distorted = np.linalg.norm(target, axis=-1)
-    r_start = np.interp(r_distorted, profile, radii)
-    xy = target * (r_start / np.maximum(r_distorted, 1e-300))[..., None]
-    for _ in range(20):
-        value, jacobian = distort(xy, coefficients)
-        residual = target - value
-        determinant = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
-        safe = np.where(np.abs(determinant) > 1e-6, determinant, np.inf)  # at the fold: no step, the residual mask tells
-        step = np.stack([
-            (jacobian[..., 1, 1] * residual[..., 0] - jacobian[..., 0, 1] * residual[..., 1]) / safe,
-            (jacobian[..., 0, 0] * residual[..., 1] - jacobian[..., 1, 0] * residual[..., 0]) / safe,
-        ], -1)  # fmt: skip
-        length = np.linalg.norm(step, axis=-1, keepdims=True)
-        xy = xy + step * np.minimum(1.0, 0.25 / np.maximum(length, 1e-300))  # trust region: stay on this branch
-        if not np.any(length > 1e-14):
-            break
-    value, jacobian = distort(xy, coefficients)
-    determinant = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
-    valid = (np.linalg.norm(target - value, axis=-1) < tolerance) & (determinant > 0) & (np.linalg.norm(xy, axis=-1) <= limit)
-    return xy, valid
+    given = torch.isfinite(pixels).all(-1)
+    distorted = (torch.where(given[..., None], pixels, 0.0) - intrinsics[..., None, 2:]) / intrinsics[..., None, :2]
+    if lens == "kannala_brandt":
+        square = distorted.square().sum(-1)
+        away = square > 1e-30
+        radius = torch.sqrt(torch.where(away, square, 1.0))
+        angle, valid = lenses.fisheye_angle(torch.where(away, radius, 0.0), coefficients)
+        valid = valid & given
+        # on the axis sin θ / r_d is one, and its gradient is that of the pixel alone
+        scale = torch.where(away, torch.sin(angle) / radius, 1.0)
+        directions = torch.cat([distorted * scale[..., None], torch.cos(angle)[..., None]], -1)
+        return torch.where(valid[..., None], directions, directions.new_tensor([0.0, 0.0, 1.0])), valid
+    ideal, valid = lenses.undistort(distorted, coefficients)
+    valid = valid & given
+    directions = torch.cat([torch.where(valid[..., None], ideal, 0.0), torch.ones_like(ideal[..., :1])], -1)
+    return directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True), valid
+
+
+def _parameters(camera: Camera) -> tuple[Tensor, Tensor, Lens]:
+    return torch.from_numpy(camera.intrinsics), torch.from_numpy(camera.coefficients), camera.lens
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Camera-frame points (..., 3) → pixels (..., 2). Points at or behind the camera give NaN."""
-    z = points[..., 2:3]
-    xy = points[..., :2] / np.where(z > 0, z, np.nan)
-    xy = distort(xy, camera.coefficients)[0]
-    return xy * np.array([camera.fx, camera.fy]) + np.array([camera.cx, camera.cy])
+    """Camera-frame points (..., 3) → pixels (..., 2), NaN where the lens sees none: behind the camera or its fold."""
+    flat = torch.from_numpy(np.array(points, dtype=np.float64).reshape(-1, 3))
+    pixels, valid = project_points(flat, *_parameters(camera))
+    return np.where(valid[:, None].numpy(), pixels.numpy(), np.nan).reshape(*np.shape(points)[:-1], 2)
 
 
 def unproject(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) → camera-frame directions (..., 3) with z = 1, and a validity mask (...)."""
-    xy = (np.asarray(pixels, dtype=np.float64) - np.array([camera.cx, camera.cy])) / np.array([camera.fx, camera.fy])
-    ideal, valid = undistort(xy, camera.coefficients)
-    return np.concatenate([ideal, np.ones_like(ideal[..., :1])], -1), valid
+    """Pixels (..., 2) → camera-frame unit directions (..., 3), and a validity mask (...)."""
+    shape = np.shape(pixels)[:-1]
+    flat = torch.from_numpy(np.array(pixels, dtype=np.float64).reshape(-1, 2))
+    directions, valid = unproject_points(flat, *_parameters(camera))
+    return directions.numpy().reshape(*shape, 3), valid.numpy().reshape(shape)
 
 
 @functools.lru_cache(maxsize=64)
@@ -163,7 +160,14 @@ def ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     directions, valid = unproject(np.stack([u, v], -1).astype(np.float64), camera)
-    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     directions.setflags(write=False)
     valid.setflags(write=False)
     return directions, valid
+
+
+def round_trip_error(camera: Camera) -> float:
+    """The largest distance [px] between a valid photosite and the projection of its ray in float32, as rays are cast; NaN without any."""
+    directions, valid = ray_map(camera)
+    pixels = np.argwhere(valid)[:, ::-1]
+    back = project(directions[valid].astype(np.float32), camera)
+    return float(np.linalg.norm(back - pixels, axis=-1).max()) if len(pixels) else float("nan")

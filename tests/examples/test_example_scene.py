@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from mmsynth.sensors.camera import Camera, project, ray_map
 from mmsynth.sensors.mosaic import mosaic
@@ -95,9 +96,10 @@ def truth_and_raw(meta: dict[str, Any], name: str, view: int) -> tuple[np.ndarra
     """Noise-free and measured light at each photosite (H, W), 1.0 = full scale."""
     data = np.load(SCENE / f"gt/{name}/{view:04d}.npz")["data"].astype(np.float64)
     if name == "polarization":
-        data = stokes_to_intensities(data, (0.0, 45.0, 90.0, 135.0))
+        data = stokes_to_intensities(torch.from_numpy(data), (0.0, 45.0, 90.0, 135.0)).numpy()
     raw = cv2.imread(str(SCENE / f"modalities/{name}/{view:04d}.png"), cv2.IMREAD_UNCHANGED)
-    return mosaic(data, np.array(meta["modalities"][name]["mosaick_pattern"])), raw / 65535.0
+    pattern = np.array(meta["modalities"][name]["mosaick_pattern"])
+    return mosaic(torch.from_numpy(data).movedim(-1, 0), pattern).numpy(), raw / 65535.0
 
 
 @pytest.mark.parametrize("view", TEST_VIEWS)
@@ -202,4 +204,4 @@ def test_brewster_reflection(script: ModuleType, roll_deg: float) -> None:
     assert stokes[0] == pytest.approx(0.5 * np.sin(2 * brewster - np.pi / 2) ** 2, rel=0.02)
     assert np.hypot(*stokes[1:]) == pytest.approx(stokes[0], rel=1e-3)
     # a camera turned counter-clockwise (seen from behind) sees the horizontal direction turned clockwise
-    assert angle_of_linear_polarization(stokes) == pytest.approx(-roll_deg, abs=0.2)
+    assert float(angle_of_linear_polarization(torch.from_numpy(stokes))) == pytest.approx(-roll_deg, abs=0.2)

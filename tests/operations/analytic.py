@@ -102,7 +102,7 @@ class AnalyticField:
                 dolp = np.where(hit, 0.3, 0.0)
                 s = np.stack([shade, shade * dolp * np.cos(2 * phi), shade * dolp * np.sin(2 * phi)], -1)
                 stokes[name] = np.where(valid[..., None], s, np.nan).astype(np.float32)
-                value = stokes_to_intensities(s, sensor.polarizer_angles_deg)
+                value = stokes_to_intensities(torch.from_numpy(s), sensor.polarizer_angles_deg).numpy()
             channels[name] = np.where(valid[..., None], value, np.nan).astype(np.float32)
         if progress is not None:
             progress(int(valid.sum()))
@@ -136,9 +136,8 @@ def scene_of(field: AnalyticField, root: Path, views: int = 4, truth: bool = Tru
             seen = field.render(camera, pose, [name])
             light = np.nan_to_num(seen.channels[name])
             path = root / "modalities" / source / f"{view:04d}.png"
-            write_png16(
-                path, light[..., 0] if sensor.channel_count == 1 else light if sensor.mosaic is None else mosaic(light, sensor.mosaic)
-            )
+            raw = light if sensor.mosaic is None else mosaic(torch.from_numpy(light).movedim(-1, 0), sensor.mosaic).numpy()
+            write_png16(path, light[..., 0] if sensor.channel_count == 1 else raw)
             frames.append(Frame(name, view, path, camera, pose, source))
             if truth and view == views - 1:
                 write_npz(root / "gt" / source / f"{view:04d}.npz", {"data": seen.stokes.get(name, light)})

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from analytic import AnalyticField, scene_of, sphere
 
 from mmsynth.errors import InputError
@@ -45,7 +46,7 @@ def test_convert_to_polarization(tmp_path: Path) -> None:
     written = convert(field, scene, "multispectral", "pol", tmp_path / "out", views=[1])  # type: ignore[arg-type]
     assert sorted(p.name for p in written) == ["0001.json", "0001.npz", "0001.png", "0001_aolp.png", "0001_dolp.png"]
     with np.load(tmp_path / "out/pol/0001.npz") as arrays:
-        assert np.allclose(stokes_to_intensities(arrays["stokes"], (0, 45, 90, 135)), arrays["data"], atol=1e-6)
+        assert np.allclose(stokes_to_intensities(torch.from_numpy(arrays["stokes"]), (0, 45, 90, 135)), arrays["data"], atol=1e-6)
         seen = arrays["opacity"] > 0.5
     assert read_image(tmp_path / "out/pol/0001_dolp.png")[seen] == pytest.approx(0.3, abs=1e-4)
 

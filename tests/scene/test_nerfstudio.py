@@ -135,9 +135,25 @@ def test_split(write_transforms: Writer, keys: dict[str, Any], test: tuple[int, 
 
 
 @pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_fisheye_is_refused(write_transforms: Writer, keys: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="OPENCV_FISHEYE is not supported yet"):
-        read_nerfstudio(write_transforms(edit=lambda meta: meta.update(keys)))
+def test_fisheyes_agree_with_opencv(write_transforms: Writer, keys: dict[str, Any]) -> None:
+    lens = {"k1": -0.03, "k2": 0.01, "k3": -0.004, "k4": 0.0006}
+
+    def edit(meta: dict[str, Any]) -> None:
+        for entry in (meta, *meta["frames"]):
+            for key in ("k1", "k2", "p1", "p2"):
+                entry.pop(key, None)
+        meta.update(keys | lens)
+
+    camera = read_nerfstudio(write_transforms(edit=edit)).frames[0].camera
+    points = np.random.default_rng(0).uniform((-2, -2, 0.5), (2, 2, 2), (30, 3))
+    matrix = np.array([[25.0, 0, 12.2], [0, 26.0, 8.9], [0, 0, 1]])
+    expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(list(lens.values())))[0][:, 0] - 0.5
+    np.testing.assert_allclose(project(points, camera), expected, atol=1e-9)
+
+
+def test_another_lens_is_refused(write_transforms: Writer) -> None:
+    with pytest.raises(InputError, match="camera_model EQUIRECTANGULAR is not supported"):
+        read_nerfstudio(write_transforms(edit=lambda meta: meta.update(camera_model="EQUIRECTANGULAR")))
 
 
 def test_scaled_rotation_is_refused(write_transforms: Writer) -> None:

@@ -69,9 +69,17 @@ def test_colmap_errors_name_the_line(tmp_path: Path, line: str, message: str) ->
         read_poses(tmp_path / "images.txt")
 
 
-def test_colmap_fisheye_is_refused(tmp_path: Path) -> None:
+def test_colmap_fisheye(tmp_path: Path) -> None:
     write_colmap(tmp_path, ring(2))
+    (tmp_path / "cameras.txt").write_text("7 OPENCV_FISHEYE 24 18 25 26 12 9 0.1 0.2 0 -0.01\n")
+    assert read_poses(tmp_path)[0][0] == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (0.1, 0.2, 0.0, -0.01), "kannala_brandt")
     (tmp_path / "cameras.txt").write_text("7 OPENCV_FISHEYE 24 18 25 26 12 9 0 0 0 0\n")
+    assert read_poses(tmp_path)[0][0] == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (), "kannala_brandt")
+
+
+def test_another_colmap_camera_is_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path, ring(2))
+    (tmp_path / "cameras.txt").write_text("7 THIN_PRISM_FISHEYE 24 18 25 26 12 9 0 0 0 0 0 0 0 0\n")
     with pytest.raises(InputError, match=r"cameras\.txt: line 1"):
         read_poses(tmp_path)
 

@@ -1,0 +1,195 @@
+"""Lens models in torch: batched, differentiable, on any device.
+
+Symbols: ``x, y`` image coordinates at unit focal length, *ideal* before the lens and *distorted* after it; r² = x² + y²; θ the angle
+off the optical axis. A lens has one row of coefficients (..., C) for N points (..., N, 2); leading dimensions broadcast.
+
+Brown-Conrady (Brown 1966, OpenCV's rational form), coefficients k1, k2, p1, p2, k3, k4, k5, k6:
+
+    radial = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
+    x_d = x radial + 2 p1 x y + p2 (r² + 2 x²)
+    y_d = y radial + p1 (r² + 2 y²) + 2 p2 x y
+
+Kannala-Brandt (Kannala and Brandt 2006, OpenCV's fisheye), coefficients k1, k2, k3, k4:
+
+    r_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸),  along the direction of (x, y)
+
+Both are polynomials that turn back somewhere: behind this *fold* two rays share a point of the image and the model has no inverse.
+The inverses start from the tabulated inverse of the rising branch, go on with Newton's method within a trust region, and are checked
+by their residual. What no ray reaches is masked, never guessed: the usual few fixed-point iterations (OpenCV, kornia) answer with
+finite numbers there, and far from the centre of strong lenses, too.
+
+The gradients of the inverses are those of the implicit function theorem: one Newton step at the solution, taken under autograd.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+STEEPEST = math.radians(80.0)  # off axis: no Brown-Conrady lens sees farther
+WIDEST = math.pi  # off axis: all that a fisheye could see
+_TABLE = 1025
+_ITERATIONS = 30
+_TOLERANCE = 1e-10  # of the residual, at unit focal length
+_STEP = 0.25  # the most that Newton's method moves at once: it stays on its branch
+_ALONG = torch.linspace(0.125, 1.0, 8, dtype=torch.float64)  # where a ray's way from the axis is looked at for folds
+
+
+def _radial(r2: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    """Radial factor and its derivative with respect to r²; r² (..., N), k (..., 1, 8)."""
+    k1, k2, _, _, k3, k4, k5, k6 = k.unbind(-1)
+    top, d_top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + 3 * r2 * k3)
+    bottom, d_bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6)), k4 + r2 * (2 * k5 + 3 * r2 * k6)
+    return top / bottom, (d_top * bottom - top * d_bottom) / bottom**2
+
+
+def distort(xy: Tensor, k: Tensor) -> Tensor:
+    """Ideal (..., N, 2) → distorted (..., N, 2), Brown-Conrady with k (..., 8)."""
+    p1, p2 = k[..., None, 2], k[..., None, 3]
+    x, y = xy.unbind(-1)
+    r2 = x * x + y * y
+    radial = _radial(r2, k[..., None, :])[0]
+    return torch.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
+
+
+def distort_jacobian(xy: Tensor, k: Tensor) -> Tensor:
+    """∂ distorted[i] / ∂ ideal[j] of ``distort``: (..., N, 2, 2)."""
+    p1, p2 = k[..., None, 2], k[..., None, 3]
+    x, y = xy.unbind(-1)
+    radial, slope = _radial(x * x + y * y, k[..., None, :])
+    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    rows = (
+        torch.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], -1),
+        torch.stack([across, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], -1),
+    )
+    return torch.stack(rows, -2)
+
+
+def fold_radius(k: Tensor) -> Tensor:
+    """Ideal radius up to which the radial profile of Brown-Conrady lenses rises, (..., 8) → (...); at most tan 80°."""
+    k = k.detach()
+
+    def slope(angle: Tensor) -> Tensor:
+        r2 = torch.tan(angle) ** 2
+        radial, d = _radial(r2, k[..., None, :])
+        return radial + 2 * r2 * d
+
+    return torch.tan(_first_fall(slope, STEEPEST, k))
+
+
+def undistort(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    """Distorted → ideal, the inverse of ``distort`` on the branch that starts at the axis.
+
+    Args:
+        xy: (..., N, 2) distorted, float32 or float64; solved in float64. k: (..., 8).
+    Returns:
+        (..., N, 2) ideal, 0 where there is none, and (..., N) bool: whether there is one. Differentiable in ``xy`` and ``k``.
+    """
+    with torch.no_grad():
+        target, lens = xy.double(), k.double()
+        limit = fold_radius(lens)
+        angles = torch.linspace(0.0, 1.0, _TABLE, dtype=torch.float64, device=k.device) * torch.atan(limit)[..., None]
+        radii = torch.tan(angles)
+        profile = radii * _radial(radii * radii, lens[..., None, :])[0]
+        distance = torch.linalg.vector_norm(target, dim=-1)
+        start = _interpolate(distance, profile, radii)
+        point = target * (start / distance.clamp(min=1e-300))[..., None]
+        for _ in range(_ITERATIONS):
+            step = _solve(distort_jacobian(point, lens), target - distort(point, lens))
+            length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+            point = point + step * (_STEP / length.clamp(min=_STEP))
+            if not bool((length > 1e-14).any()):
+                break
+        close = torch.linalg.vector_norm(target - distort(point, lens), dim=-1) < _TOLERANCE
+        valid = close & (torch.linalg.vector_norm(point, dim=-1) <= limit[..., None])
+        for share in _ALONG.tolist():  # tangential terms may fold, too: the orientation holds all the way from the axis
+            j = distort_jacobian(share * point, lens)
+            valid &= j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0] > 0
+        point = torch.where(valid[..., None], point, 0.0).to(xy.dtype)
+        jacobian = distort_jacobian(point, k)
+    if xy.requires_grad or k.requires_grad:
+        onward = _solve(jacobian, torch.where(valid[..., None], xy - distort(point, k), 0.0))
+        point = point + onward - onward.detach()
+    return point, valid
+
+
+def _solve(matrix: Tensor, right: Tensor) -> Tensor:
+    """2x2 systems; no step where the matrix has no inverse: a residual tells."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    determinant = a * d - b * c
+    determinant = torch.where(determinant.abs() > 1e-6, determinant, torch.inf)
+    u, v = right.unbind(-1)
+    return torch.stack([(d * u - b * v) / determinant, (a * v - c * u) / determinant], -1)
+
+
+def fisheye_radius(angle: Tensor, k: Tensor) -> Tensor:
+    """Angle off axis (..., N) [rad] → distance from the image's centre (..., N), Kannala-Brandt with k (..., 4)."""
+    k1, k2, k3, k4 = k[..., None, :].unbind(-1)
+    a2 = angle * angle
+    return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+
+
+def fisheye_slope(angle: Tensor, k: Tensor) -> Tensor:
+    """Derivative of ``fisheye_radius`` with respect to the angle."""
+    k1, k2, k3, k4 = k[..., None, :].unbind(-1)
+    a2 = angle * angle
+    return 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
+
+
+def fisheye_fold(k: Tensor) -> Tensor:
+    """Angle [rad] up to which ``fisheye_radius`` rises, (..., 4) → (...); at most π."""
+    k = k.detach()
+    return _first_fall(lambda angle: fisheye_slope(angle, k), WIDEST, k)
+
+
+def fisheye_angle(radius: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of ``fisheye_radius`` on its rising branch.
+
+    Args:
+        radius: (..., N) ≥ 0, at unit focal length. k: (..., 4).
+    Returns:
+        (..., N) angle [rad], 0 where there is none, and (..., N) bool: whether there is one. Differentiable in both arguments.
+    """
+    with torch.no_grad():
+        target, lens = radius.double(), k.double()
+        limit = fisheye_fold(lens)
+        angles = torch.linspace(0.0, 1.0, _TABLE, dtype=torch.float64, device=k.device) * limit[..., None]
+        angle = _interpolate(target, fisheye_radius(angles, lens), angles)
+        for _ in range(_ITERATIONS):
+            slope = fisheye_slope(angle, lens)
+            step = (target - fisheye_radius(angle, lens)) / torch.where(slope > 1e-6, slope, torch.inf)
+            angle = angle + step.clamp(-_STEP, _STEP)
+            if not bool((step.abs() > 1e-14).any()):
+                break
+        valid = ((target - fisheye_radius(angle, lens)).abs() < _TOLERANCE) & (angle <= limit[..., None]) & (angle >= 0)
+        angle = torch.where(valid, angle, 0.0).to(radius.dtype)
+        slope = fisheye_slope(angle, k)
+    if radius.requires_grad or k.requires_grad:
+        onward = torch.where(valid, radius - fisheye_radius(angle, k), 0.0) / slope
+        angle = angle + onward - onward.detach()
+    return angle, valid
+
+
+def _first_fall(slope: Callable[[Tensor], Tensor], most: float, k: Tensor) -> Tensor:
+    """Where a profile's slope (of (..., M) angles) is first not positive, (...); ``most`` where it is up to there."""
+    angles = torch.linspace(0.0, most, 4 * _TABLE, dtype=k.dtype, device=k.device).expand(*k.shape[:-1], 4 * _TABLE)
+    falls = ~(slope(angles) > 0)
+    first = falls.int().argmax(-1, keepdim=True)
+    low, high = angles.gather(-1, (first - 1).clamp(min=0)), angles.gather(-1, first)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        rising = slope(middle) > 0
+        low, high = torch.where(rising, middle, low), torch.where(rising, high, middle)
+    return torch.where(falls.any(-1), low[..., 0], most)
+
+
+def _interpolate(x: Tensor, at: Tensor, values: Tensor) -> Tensor:
+    """Piecewise linear through (at, values), both (..., M) and rising, at x (..., N); constant beyond the ends."""
+    at, values = (t.expand(*x.shape[:-1], t.shape[-1]).contiguous() for t in (at, values))
+    upper = torch.searchsorted(at, x.contiguous()).clamp(1, at.shape[-1] - 1)
+    x0, x1, y0, y1 = at.gather(-1, upper - 1), at.gather(-1, upper), values.gather(-1, upper - 1), values.gather(-1, upper)
+    share = ((x - x0) / (x1 - x0).clamp(min=1e-300)).clamp(0.0, 1.0)
+    return y0 + share * (y1 - y0)
