@@ -384,6 +384,20 @@ def bench_ablation(
     _print_report(report, as_json)
 
 
+@command("numerics", of=bench_app)
+def bench_numerics(
+    only: Annotated[str | None, typer.Option(help="undistortion, opacity, normals, angles, demosaicking, resampling; default: all")] = None,
+    out: Annotated[Path, typer.Option()] = Path("bench/numerics"),
+    as_json: JsonOption = False,
+) -> None:
+    """What is computed approximately: ns per element against error, ours beside the usual ways."""
+    from mmsynth.bench.numerics import bench_numerics as measure
+
+    with _bar("bench numerics", as_json) as show:
+        report = measure(out, None if only is None else [name.strip() for name in only.split(",")], progress=show)
+    _print_report(report, as_json)
+
+
 def _print_report(report: Any, as_json: bool) -> None:
     from mmsynth.bench.tables import print_tables
 

@@ -90,3 +90,30 @@ def write_transforms(tmp_path: Path) -> Callable[..., Path]:
         return root
 
     return write
+
+
+# --- the table of hard cases: pytest tests/hard_cases --hard-cases FILE
+
+_ROWS = pytest.StashKey[list[tuple[str, str, str, str]]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--hard-cases", metavar="FILE", help="write the table of hard cases")
+
+
+@pytest.fixture
+def row(request: pytest.FixtureRequest) -> Callable[[str, str, str], None]:
+    """row(case, usual, ours): a line of the table."""
+    rows = request.config.stash.setdefault(_ROWS, [])
+    test = f"{Path(request.node.path).stem.removeprefix('test_')}: {request.node.originalname.removeprefix('test_').replace('_', ' ')}"
+    return lambda case, usual, ours: rows.append((case, usual, ours, test))
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    target = session.config.getoption("--hard-cases", None)
+    if not target or exitstatus != 0:
+        return
+    lines = ["| case | the usual formula | ours | test |", "|:--|:--|:--|:--|"]
+    lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |" for cells in session.config.stash.get(_ROWS, [])]
+    head = "# Hard cases\n\nMade by `pytest tests/hard_cases --hard-cases tests/hard_cases/README.md`: what the tests measured.\n\n"
+    Path(target).write_text(head + "\n".join(lines) + "\n", encoding="utf-8")

@@ -40,6 +40,8 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
 
     Args:
         features: (R, F). opacity: (R,). batch: the R rays and what was measured along them.
+    Returns:
+        by modality; NaN where every number is clipped.
     """
     learned = batch.ray % 2 == 0
     usable = batch.target < batch.saturation
@@ -62,8 +64,8 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
 
 
 def degree_needed(errors: list[float], worth: float) -> int:
-    """The lowest degree whose error is within ``worth`` (a share) of the best."""
-    return next(degree for degree, error in enumerate(errors) if error <= (1.0 + worth) * min(errors))
+    """The lowest degree whose error is within ``worth`` (a share) of the best; 0 where nothing could be judged and errors are NaN."""
+    return next((degree for degree, error in enumerate(errors) if error <= (1.0 + worth) * min(errors)), 0)
 
 
 def exposure_spread(residuals: Residuals, frames: int) -> tuple[float, float]:

@@ -255,7 +255,8 @@ class Trainer:
         for name, (_, numbers) in batch.parts.items():
             if recipe.view_dependence == "auto":
                 degree = probe.degree_needed(errors[name], recipe.view_dependence_worth)
-                grown = ", ".join(f"{e / errors[name][-1] - 1:+.1%}" for e in errors[name][:-1])
+                best = errors[name][-1]
+                grown = ", ".join(f"{e / best - 1:+.1%}" for e in errors[name][:-1]) if best > 0 else "nothing that could be told apart"
                 evidence[f"view_dependence.{name}"] = f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}"
             else:
                 degree = recipe.view_dependence

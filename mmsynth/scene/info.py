@@ -10,7 +10,7 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.scene.images import check_file, load_frame, read_native, used_bits
 from mmsynth.scene.scene import Frame, Scene, Sensor
-from mmsynth.sensors.camera import Camera, unproject
+from mmsynth.sensors.camera import Camera, round_trip_error
 
 
 def describe(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
@@ -40,8 +40,9 @@ def describe(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
 def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problems: list[str]) -> dict[str, Any]:
     """frames (and how many train, test, have a mask), size [width, height] of the first frame, channels, wavelengths_nm, mosaic,
     polarizer_angles_deg, file_type, bits in use and saturation (None: float data, never), pixel statistics mean, min, max,
-    saturated_percent over frames_measured, and invalid_lens_pixels: photosites of the first frame without a ray (an estimate from
-    every n-th row and column where the frame has more than 250 000 pixels)."""
+    saturated_percent over frames_measured, and the lens of the first frame: its model, invalid_lens_pixels, photosites without a ray,
+    and round_trip_px, how far from its pixel a ray in float32 comes back at the most (of every n-th row and column where the frame has
+    more than 250 000 pixels)."""
     frames = scene.frames_of(sensor.name)
     camera = frames[0].camera
     out: dict[str, Any] = {
@@ -56,7 +57,7 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
         "mosaic": None if sensor.mosaic is None else sensor.mosaic.tolist(),
         "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
         "saturation": sensor.saturation if math.isfinite(sensor.saturation) else None,
-        "invalid_lens_pixels": invalid_lens_pixels(camera),
+        **_lens(camera),
     }
     problems += _damaged(frames)
     out |= _file_type(frames, problems) | _statistics(sensor, frames, measured_frames, problems)
@@ -65,12 +66,16 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
     return out
 
 
-def invalid_lens_pixels(camera: Camera, most: int = 250_000) -> int:
-    """How many photosites have no ray, because the lens model has no inverse there; estimated on a grid of ``most`` pixels."""
+def _lens(camera: Camera, most: int = 250_000) -> dict[str, Any]:
+    """Which model, how many photosites have no ray, because it has no inverse there, and how far off the rays of the others are."""
     step = math.ceil(math.sqrt(max(1.0, camera.width * camera.height / most)))
     v, u = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
-    _, valid = unproject(np.stack([u, v], -1).astype(np.float64), camera)
-    return round(float(np.mean(~valid)) * camera.width * camera.height)
+    error, missing = round_trip_error(camera, np.stack([u, v], -1).reshape(-1, 2).astype(np.float64))
+    return {
+        "lens": "pinhole" if camera.lens == "brown_conrady" and not any(camera.distortion) else camera.lens,
+        "invalid_lens_pixels": round(missing * camera.width * camera.height),
+        "round_trip_px": error if math.isfinite(error) else None,
+    }
 
 
 def _damaged(frames: tuple[Frame, ...]) -> list[str]:
@@ -165,9 +170,14 @@ def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
             f"  values    {sensor['min']:.4f} to {sensor['max']:.4f}, mean {sensor['mean']:.4f}, "
             f"{sensor['saturated_percent']:.2f} % saturated (in {sensor['frames_measured']} frames)"
         )
-    if sensor["invalid_lens_pixels"]:
-        share = 100 * sensor["invalid_lens_pixels"] / (width * height)
-        lines.append(f"  lens      {sensor['invalid_lens_pixels']} pixels ({share:.2f} %) have no ray and are not used")
+    back = (
+        "no pixel has a ray"
+        if sensor["round_trip_px"] is None
+        else f"rays come back to their pixels within {sensor['round_trip_px']:.1g} px"
+    )
+    share = 100 * sensor["invalid_lens_pixels"] / (width * height)
+    lost = f"; {sensor['invalid_lens_pixels']} pixels ({share:.2f} %) have no ray and are not used" if share else ""
+    lines.append(f"  lens      {sensor['lens']}, {back}{lost}")
     return lines
 
 

@@ -93,7 +93,8 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
 
     Where the axes have no common point in front of most cameras (one camera, parallel axes, looking outwards), the ball is
     put ahead of the cameras' mean position, along their mean direction, at twice their spread (1 unit for a single
-    position), and fills a frame as above; a panorama without mean direction gets a ball of that distance around itself.
+    position), and fills a frame as above. Without a mean direction it is around the cameras' mean position: cameras that face
+    each other see it as above, a panorama is inside a ball of twice its spread.
 
     Args:
         cameras, poses: one per frame; poses (4, 4), OpenCV axes.
@@ -110,18 +111,29 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
         # solved about the mean position: worlds far from their origin (survey coordinates) keep their digits
         mean = centres.mean(0)
         point = mean + np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres - mean) / len(centres))
-        if np.mean(np.einsum("ni,ni->n", point - centres, axes) > 0) > 0.5:
-            distance = np.linalg.norm(centres - point, axis=1)
-            radius = min(float(np.median(distance * np.sin(half_view))), 0.9 * max(float(distance.min()), float(np.median(distance)) / 9))
-            return Region(_triple(point), radius)
+        if _before(point, centres, axes):
+            return _filling(point, centres, half_view)
     mean = centres.mean(0)
     reach = 2 * float(np.linalg.norm(centres - mean, axis=1).max())
     reach = reach if reach > 1e-9 * max(1.0, float(np.linalg.norm(mean))) else 1.0  # one position up to rounding
     direction = axes.mean(0)
     length = float(np.linalg.norm(direction))
-    if length < 0.1:
-        return Region(_triple(mean), reach)
+    if length < 0.5:
+        # cameras that face each other along one line, or a panorama
+        return _filling(mean, centres, half_view) if _before(mean, centres, axes) else Region(_triple(mean), reach)
     return Region(_triple(mean + reach * direction / length), reach * float(np.sin(np.median(half_view))))
+
+
+def _before(point: np.ndarray, centres: np.ndarray, axes: np.ndarray) -> bool:
+    """Whether it lies in front of most cameras."""
+    return bool(np.mean(np.einsum("ni,ni->n", point - centres, axes) > 0) > 0.5)
+
+
+def _filling(point: np.ndarray, centres: np.ndarray, half_view: np.ndarray) -> Region:
+    """The ball around a point that just fills the frame of a typical camera, and leaves the cameras outside."""
+    distance = np.linalg.norm(centres - point, axis=1)
+    radius = min(float(np.median(distance * np.sin(half_view))), 0.9 * max(float(distance.min()), float(np.median(distance)) / 9))
+    return Region(_triple(point), radius)
 
 
 def region_from_points(points: np.ndarray, seen: Region, positions: np.ndarray) -> Region:

@@ -165,9 +165,14 @@ def ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return directions, valid
 
 
-def round_trip_error(camera: Camera) -> float:
-    """The largest distance [px] between a valid photosite and the projection of its ray in float32, as rays are cast; NaN without any."""
-    directions, valid = ray_map(camera)
-    pixels = np.argwhere(valid)[:, ::-1]
+def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:
+    """How well rays of pixels (N, 2) come back.
+
+    Returns:
+        the largest distance [px] between a pixel and the projection of its ray in float32, as rays are cast (NaN where no pixel has
+        one), and the share of pixels that have no ray.
+    """
+    directions, valid = unproject(pixels, camera)
     back = project(directions[valid].astype(np.float32), camera)
-    return float(np.linalg.norm(back - pixels, axis=-1).max()) if len(pixels) else float("nan")
+    distance = np.linalg.norm(back - pixels[valid], axis=-1)
+    return (float(distance.max()) if valid.any() else float("nan")), float(np.mean(~valid))

@@ -92,3 +92,12 @@ def test_a_fit_of_few_frames_is_scored_on_all_test_views(tmp_path: Path) -> None
     scores = json.loads(call("evaluate", "--json").stdout)
     assert scores["views"] == json.loads((tmp_path / "runs/latest/manifest.json").read_text())["scene"]["test_views"]
     assert set(scores["modalities"]) == {"rgb", "pol"}
+
+
+def test_bench_numerics(tmp_path: Path) -> None:
+    result = call("bench", "numerics", "--only", "angles,resampling", "--json")
+    assert result.exit_code == 0, result.output
+    results = json.loads(result.stdout)
+    assert results["out"] == "bench/numerics" and {row["family"] for row in results["rows"]} == {"angles", "resampling"}
+    assert {path.name for path in (tmp_path / "bench" / "numerics").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    refused(call("bench", "numerics", "--only", "magic"), "'magic'", "undistortion")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from mmsynth.field.rendering import Hits, Sampling, ball_interval, trace, trace_
 from mmsynth.field.surface import Surface
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
+
+Row = Callable[[str, str, str], None]
 
 
 def neus_weights(sdf: torch.Tensor, s: float) -> torch.Tensor:
@@ -78,10 +81,12 @@ def _towards(count: int, miss: float, distance: float = 3.0) -> tuple[torch.Tens
 # --- empty space, deep inside, any sharpness
 
 
-def test_empty_space_haze() -> None:
+def test_empty_space_haze(row: Row) -> None:
     sdf = torch.full((1025,), 0.3)
-    assert neus_weights(sdf, 512.0).sum() > 0.009
+    usual = neus_weights(sdf, 512.0).sum()
+    assert usual > 0.009
     assert ours(sdf, 512.0).sum() == 0.0
+    row("1024 samples of empty space, s = 512", f"NeuS: opacity {usual:.3f}", "0, exactly")
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -103,12 +108,17 @@ def test_empty_space_has_exactly_no_opacity(way: str, s: float) -> None:
         assert hits.samples > 100 and not (hits.opacity > (0 if way == "fused" else 1e-30)).any()
 
 
-def test_deep_inside() -> None:
+def test_deep_inside(row: Row) -> None:
     """Falling through the inside of an object at f = -0.05: the exact opacity of a section is 0.641."""
     sdf = torch.tensor([-0.05, -0.052])
     exact = 1 - np.exp(-512 * 0.002)
     assert neus_weights(sdf, 512.0)[0] > 0.99
     assert float(ours(sdf, 512.0)[0]) == pytest.approx(exact, abs=1e-5)
+    row(
+        "a section deep inside, f = -0.05, s = 512",
+        f"NeuS: opacity {neus_weights(sdf, 512.0)[0]:.3f}",
+        f"{ours(sdf, 512.0)[0]:.3f}; exact {exact:.3f}",
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -124,7 +134,7 @@ def test_a_camera_deep_inside_sees_what_the_formula_says(way: str, s: float) -> 
 
 
 @pytest.mark.parametrize("s", [1.0, 1e3, 1e6])
-def test_any_sharpness_is_finite_and_sums_to_at_most_one(s: float) -> None:
+def test_any_sharpness_is_finite_and_sums_to_at_most_one(row: Row, s: float) -> None:
     sdf = torch.linspace(1.0, -1.0, 777).requires_grad_()
     weights = ours(sdf, s)
     weights.square().sum().backward()
@@ -132,6 +142,12 @@ def test_any_sharpness_is_finite_and_sums_to_at_most_one(s: float) -> None:
     assert float(weights.detach().double().sum()) <= 1 + 1e-6
     expected = 1 - (1 / (1 + np.exp(s))) / (1 / (1 + np.exp(-s))) if s < 100 else 1.0
     assert float(weights.detach().sum()) == pytest.approx(expected, abs=1e-5)
+    usual = neus_weights(sdf.detach(), s).sum()
+    row(
+        f"through a surface, s = {s:g}",
+        f"NeuS: opacity {usual:.5f}",
+        f"{float(weights.detach().sum()):.5f}; exact {expected:.5f}, gradients finite",
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -156,13 +172,14 @@ def test_any_sharpness_gives_finite_rays_and_gradients(way: str, classified: boo
     assert all(torch.isfinite(g).all() for g in found) and origins.grad.any()
 
 
-def test_opaque_section_does_not_divide_by_zero() -> None:
+def test_opaque_section_does_not_divide_by_zero(row: Row) -> None:
     """α = 1 exactly, then more samples: cumprod needs an epsilon, exp(-Σ) does not."""
     sdf = torch.tensor([1.0, -1.0, -2.0, 1.0, -1.0]).requires_grad_()
     weights = ours(sdf, 1e4)
     weights.sum().backward()
     assert weights.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
     assert torch.isfinite(sdf.grad).all()
+    row("samples behind an opaque section", "cumprod of 0: an epsilon of 1e-7, and half the speed", "exp of a sum: weights 1, 0, 0, 0")
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -213,7 +230,7 @@ def test_depth_of_the_horizon_is_exact(way: str) -> None:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_camera_inside_the_region_and_zero_samples(way: str) -> None:
+def test_camera_inside_the_region_and_zero_samples(row: Row, way: str) -> None:
     origins = torch.tensor([[0.0, 0.0, -0.8], [0.0, 0.0, -0.8], [0.0, 0.0, 5.0], [3.0, 0.0, 0.0]])
     directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     depth = _trace(way, _parts(), origins, directions).depth
@@ -224,6 +241,11 @@ def test_camera_inside_the_region_and_zero_samples(way: str) -> None:
     assert int(nothing.samples) == 0 and torch.isnan(nothing.depth).all() and not nothing.opacity.any() and not nothing.features.any()
     (nothing.opacity.sum() + nothing.features.sum()).backward()
     assert all(p.grad is None or not p.grad.any() for m in parts for p in m.parameters())
+    row(
+        f"a camera inside the region; a batch without a sample, {way}",
+        "empty tensors: a crash",
+        "its depth, to 1e-3; nothing, and no gradient",
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -247,7 +269,7 @@ def test_rays_of_no_sample_and_of_one_between_others(way: str) -> None:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_rays_in_a_face_of_a_grid_cell_are_finite(way: str) -> None:
+def test_rays_in_a_face_of_a_grid_cell_are_finite(row: Row, way: str) -> None:
     """Axis-parallel rays exactly in cell faces: the slab test's 0 / 0."""
     surface, appearance, _ = _parts()
     occupancy = Occupancy(8)
@@ -257,6 +279,9 @@ def test_rays_in_a_face_of_a_grid_cell_are_finite(way: str) -> None:
     hits = _trace(way, (surface, appearance, occupancy), origins, directions)
     assert float(hits.depth[0]) == pytest.approx(2 - np.sqrt(0.25 - 0.125), abs=1e-3)
     assert not hits.opacity[1:].any() and hits.depth[1:].isnan().all()
+    slab = (torch.tensor([-0.25, 0.25]) - origins[:, 1:2]) / directions[:, 1:2]
+    assert slab.isnan().any()
+    row(f"rays in the face of a cell, {way}", "the slab test: 0 / 0 = NaN", "the depth of the ball, to 1e-3")
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -275,7 +300,7 @@ def test_rays_along_axes_and_diagonals_of_cells_see_what_their_neighbours_see(wa
     torch.testing.assert_close(hits.depth, aside.depth, atol=2e-3, rtol=0)
 
 
-def test_ball_interval_of_tangent_and_receding_rays() -> None:
+def test_ball_interval_of_tangent_and_receding_rays(row: Row) -> None:
     origins = torch.tensor([[-2.0, 1.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-1e4, 0.5, 0.0]])
     directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(4, 3)
     near, far = ball_interval(origins, directions)
@@ -283,6 +308,13 @@ def test_ball_interval_of_tangent_and_receding_rays() -> None:
     assert near[2] == 0 and far[2] == 1
     # a camera 10,000 radii away: |o|² - (o·d)² in float32 would lose the chord entirely
     assert float(far[3] - near[3]) == pytest.approx(2 * np.sqrt(0.75), abs=5e-3)
+    o, d = origins[3], directions[3]
+    usual = 2 * torch.sqrt(((o @ d) ** 2 - o @ o + 1).clamp(min=0))
+    row(
+        "the chord of a ball 10,000 radii away, float32",
+        f"(o·d)² - |o|² + 1: {float(usual):.2f}",
+        f"{float(far[3] - near[3]):.3f}; exact 1.732",
+    )
 
 
 @pytest.mark.parametrize("way", ["fused", "by parts"])
@@ -336,7 +368,7 @@ def _bounds(half: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("steps", [0.2, 0.5, 1.0, 3.0])
-def test_a_thin_sheet_is_not_stepped_over(steps: float) -> None:
+def test_a_thin_sheet_is_not_stepped_over(row: Row, steps: float) -> None:
     """Thinner than a step and far from where the ray begins: the distance says where to look."""
     half = steps * SAMPLING.step / 2
     tilted = normalize(torch.tensor([[0.0, 0.0, 1.0], [0.3, 0.1, 1.0], [0.0, -0.8, -1.0]]), dim=1).repeat(60, 1).double()
@@ -349,6 +381,13 @@ def test_a_thin_sheet_is_not_stepped_over(steps: float) -> None:
     occupancy.update(lambda x: _Sheet(half)(x, 1), SAMPLING.sharpness, torch.Generator().manual_seed(0), 1.0)
     fewer = trace_by_parts(_Sheet(half), HashGrid(1, 8, 4, 4).double(), occupancy, -0.9 * tilted, tilted, near, far, jitter, SAMPLING)
     assert fewer.samples < hits.samples and float(fewer.opacity.min()) >= low - 1e-6
+    at = -0.9 * tilted[:, 2:] + tilted[:, 2:] * (torch.arange(64) + jitter[:, None]) / 64 * 1.8
+    usual = float((at.abs() - half < 0).any(1).double().mean())
+    row(
+        f"a sheet of {steps:g} steps' thickness",
+        f"64 even samples: {usual:.0%} of the rays meet it",
+        f"all rays, opacity from {float(hits.opacity.min()):.2f} on",
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -416,7 +455,7 @@ def test_not_a_number_stays_in_its_ray(way: str) -> None:
 # --- the occupancy grid
 
 
-def test_an_empty_occupancy_grid_reopens() -> None:
+def test_an_empty_occupancy_grid_reopens(row: Row) -> None:
     occupancy = Occupancy(8)
     generator = torch.Generator().manual_seed(0)
     assert not occupancy.update(lambda x: torch.full((len(x),), 5.0), 100.0, generator, 1.0)
@@ -429,6 +468,11 @@ def test_an_empty_occupancy_grid_reopens() -> None:
     hits = _trace("fused", (surface, appearance, occupancy), *_towards(20, 0.1))
     assert (hits.opacity > 0.99).all()
     assert occupancy.update(lambda x: surface(x, 2), 100.0, generator, 1.0)
+    row(
+        "an occupancy grid in which nothing is left",
+        "0 samples, aborting; or a white picture for ever",
+        "opened again, counted, and what appears is seen",
+    )
 
 
 def test_a_pruned_cell_comes_back() -> None:
@@ -462,7 +506,7 @@ def test_occupancy_loses_no_surface(way: str, extent: float) -> None:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_one_hash_level(way: str) -> None:
+def test_one_hash_level(row: Row, way: str) -> None:
     grid = HashGrid(1, 8, 4, 100)
     assert torch.isfinite(grid(torch.rand(5, 3), 1)).all() and grid.resolutions.tolist() == [4]
     parts = _parts(levels=1)
@@ -470,6 +514,7 @@ def test_one_hash_level(way: str) -> None:
     exact = torch.full((50,), 3 - np.sqrt(0.25 - 0.09)).to(hits.depth)
     torch.testing.assert_close(hits.depth, exact, atol=3e-4, rtol=0)
     assert hits.features.shape == (50, 4)
+    row(f"one hash level, {way}", "growth (b / a)^(1 / (L - 1)): 0 / 0", f"depth to {float((hits.depth - exact).abs().max()):.0e}")
 
 
 def test_no_active_level() -> None:

@@ -1,0 +1,398 @@
+"""``mmsynth bench numerics``: speed against error of what is computed approximately, ours beside the usual ways.
+
+Each family compares methods on problems whose exact answer is known: by construction, by the forward model, or in float64. Speeds
+are medians of repeats in which the methods take turns, on one thread, per element. To add a method, add a ``Method`` to its family.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import kornia
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from mmsynth.bench.machine import measure, use_threads
+from mmsynth.bench.output import Report, new_figure, write_report
+from mmsynth.bench.tables import Column, Table
+from mmsynth.errors import InputError
+from mmsynth.field.kernels import reference
+from mmsynth.operations.progress import Progress
+from mmsynth.sensors import lenses
+from mmsynth.sensors.camera import Camera, unproject
+from mmsynth.sensors.mosaic import demosaic, demosaic_edge_aware, mosaic
+from mmsynth.sensors.polarization import (
+    angle_of_linear_polarization,
+    aolp_difference,
+    degree_of_linear_polarization,
+    intensities_to_stokes,
+    stokes_to_intensities,
+)
+
+REPEATS = 7
+_RGGB = np.array([[0, 1], [1, 2]])
+_POL, _POL_ANGLES = np.array([[2, 1], [3, 0]]), (0.0, 45.0, 90.0, 135.0)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to compute something.
+
+    Attributes:
+        problem: what on. name: how. run: the computation. judge: its result → ``error`` (typical), ``worst`` and what else the table has.
+        count: elements of a run; times are per element.
+    """
+
+    family: str
+    problem: str
+    name: str
+    run: Callable[[], Any]
+    judge: Callable[[Any], dict[str, float]]
+    count: int
+    unit: str
+
+
+def _typical(error: np.ndarray) -> dict[str, float]:
+    error = np.asarray(error, dtype=np.float64)
+    return {"error": float(np.sqrt(np.mean(error**2))), "worst": float(error.max())} if error.size else {}
+
+
+# ------------------------------------------------------------------------------------------------------------------- the families
+
+
+def undistortion() -> list[Method]:
+    """Pixels to rays of a lens, judged by OpenCV's forward model [px at f = 1000]. Missing: has no ray, or the method gave none."""
+    methods = []
+    for k1, k2, degrees in ((-0.1, 0.02, 60.0), (-0.28, 0.07, 95.0), (0.4, 0.0, 95.0), (-0.35, 0.0, 120.0)):
+        focal = 160 / math.tan(math.radians(degrees / 2))
+        camera = Camera(321, 241, focal, focal, 160.0, 120.0, (k1, k2, 1e-3, -5e-4))
+        pixels = np.stack(np.meshgrid(np.arange(321.0), np.arange(241.0)), -1).reshape(-1, 2)
+        matrix, k = camera.matrix, camera.coefficients
+        plane = torch.from_numpy((pixels - [160.0, 120.0]) / focal)
+
+        def opencv(iterations: int, pixels: np.ndarray = pixels, matrix: np.ndarray = matrix, k: np.ndarray = k) -> np.ndarray:
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, iterations, 1e-12)
+            return cv2.undistortPoints(pixels[:, None], matrix, k, criteria=criteria)[:, 0]
+
+        def by_kornia(plane: Tensor = plane, k: np.ndarray = k) -> np.ndarray:
+            return kornia.geometry.calibration.undistort_points(plane[None], torch.eye(3).double()[None], torch.from_numpy(k)[None])[
+                0
+            ].numpy()
+
+        def newton(plane: Tensor = plane, k: np.ndarray = k) -> np.ndarray:
+            point, lens = plane.clone(), torch.from_numpy(k)
+            for _ in range(10):
+                step, singular = torch.linalg.solve_ex(
+                    lenses.distort_jacobian(point, lens), (plane - lenses.distort(point, lens))[..., None]
+                )
+                point = torch.where((singular == 0)[:, None], point + step[..., 0], point)
+            return point.numpy()
+
+        def ours(pixels: np.ndarray = pixels, camera: Camera = camera) -> np.ndarray:
+            directions, valid = unproject(pixels, camera)
+            return np.where(valid[:, None], directions[:, :2] / directions[:, 2:], np.nan)
+
+        def judge(ideal: np.ndarray, pixels: np.ndarray = pixels, matrix: np.ndarray = matrix, k: np.ndarray = k) -> dict[str, float]:
+            given = np.isfinite(ideal).all(-1)
+            points = np.concatenate([ideal[given], np.ones((given.sum(), 1))], 1)
+            back = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
+            error = np.nan_to_num(np.linalg.norm(back - pixels[given], axis=1) * 1000 / matrix[0, 0], nan=np.inf)
+            # beyond the fold a residual may be small by chance, on the wrong branch
+            limit = float(lenses.fold_radius(torch.from_numpy(k)))
+            wrong = (error > 0.1) | (np.linalg.norm(ideal[given], axis=1) > limit)
+            return {
+                "error": float(np.median(error)), "worst": float(error.max()), "wrong": float(wrong.mean()),
+                "missing": float(1 - given.mean()),
+            }  # fmt: skip
+
+        problem = f"{degrees:.0f}°, k1 = {k1:g}, k2 = {k2:g}"
+        for name, run in (
+            ("OpenCV, 5 iterations", functools.partial(opencv, 5)),
+            ("OpenCV, 20 iterations", functools.partial(opencv, 20)),
+            ("OpenCV, 100 iterations", functools.partial(opencv, 100)),
+            ("kornia, 5 iterations", by_kornia),
+            ("Newton, 10 steps, unchecked", newton),
+            ("mmsynth", ours),
+        ):
+            methods.append(Method("undistortion", problem, name, run, judge, len(pixels), "px"))
+    return methods
+
+
+def opacity() -> list[Method]:
+    """Opacity of sections of a ray, by SDF at their ends, judged in float64."""
+    methods = []
+    random = torch.Generator().manual_seed(0)
+    for s in (64.0, 512.0, 1e4):
+        lines = {
+            "1024 sections of empty space": torch.full((1025,), 0.3),
+            "through a surface": (24.0 - torch.arange(48.0)) * 2.0 / s,
+            "one section deep inside": torch.tensor([-0.05, -0.05 - 1.0 / s]),
+        }
+        for problem, line in lines.items():
+            sdf = line + 0.01 / s * torch.rand(64, len(line), generator=random)
+            offsets = torch.arange(0, sdf.numel() + 1, len(line))
+
+            def ours(dtype: torch.dtype, sdf: Tensor = sdf, offsets: Tensor = offsets, s: float = s) -> Tensor:
+                weights = reference.section_weights(sdf.to(dtype).reshape(-1), s, offsets)[0]
+                return weights.reshape(len(sdf), -1).sum(1)
+
+            def neus(dtype: torch.dtype, sdf: Tensor = sdf, s: float = s) -> Tensor:
+                f = torch.sigmoid(sdf.to(dtype) * s)
+                alpha = ((f[:, :-1] - f[:, 1:] + 1e-5) / (f[:, :-1] + 1e-5)).clamp(0, 1)
+                through = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha + 1e-7], 1), 1)
+                return (alpha * through[:, :-1]).sum(1)
+
+            exact = 1 - torch.exp(
+                -torch.relu(
+                    torch.nn.functional.softplus(-s * sdf.double()[:, 1:]) - torch.nn.functional.softplus(-s * sdf.double()[:, :-1])
+                ).sum(1)
+            )
+
+            def judge(found: Tensor, exact: Tensor = exact) -> dict[str, float]:
+                return _typical((found.double() - exact).abs().numpy())
+
+            for name, run in (
+                ("NeuS, 1e-5, float32", functools.partial(neus, torch.float32)),
+                ("NeuS, 1e-5, float16", functools.partial(neus, torch.float16)),
+                ("mmsynth, float32", functools.partial(ours, torch.float32)),
+                ("mmsynth, float64", functools.partial(ours, torch.float64)),
+            ):
+                methods.append(Method("opacity", f"{problem}, s = {s:g}", name, run, judge, sdf.numel(), "1"))
+    return methods
+
+
+def normals() -> list[Method]:
+    """Normals by finite differences of the distance to a sphere of radius 0.6, whose values were rounded to a type."""
+    generator = torch.Generator().manual_seed(0)
+    outward = torch.nn.functional.normalize(torch.randn(20000, 3, generator=generator, dtype=torch.float64), dim=1)
+    points = 0.65 * outward  # where the distance is 0.05
+    taps = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], dtype=torch.float64)
+
+    def four_taps(epsilon: float, dtype: torch.dtype) -> Tensor:
+        at = points[:, None] + taps * (epsilon / 3**0.5)
+        return (at.norm(dim=-1) - 0.6).to(dtype).double() @ taps
+
+    def central(epsilon: float, dtype: torch.dtype) -> Tensor:
+        at = points[:, None, None] + epsilon * torch.stack([torch.eye(3), -torch.eye(3)], 1).double()
+        f = (at.norm(dim=-1) - 0.6).to(dtype).double()
+        return f[..., 0] - f[..., 1]
+
+    def judge(found: Tensor) -> dict[str, float]:
+        angle = torch.atan2(torch.linalg.cross(found, outward).norm(dim=1), (found * outward).sum(1))
+        return _typical(torch.rad2deg(angle).numpy())
+
+    methods = []
+    for epsilon in (1 / 64, 1 / 256, 1 / 1024, 1 / 4096):
+        for kind, way in (("4 taps", four_taps), ("6 taps", central)):
+            for dtype in (torch.float32, torch.float16, torch.bfloat16):
+                name = f"{kind}, {str(dtype).removeprefix('torch.')}" + (
+                    " (mmsynth)" if kind == "4 taps" and dtype == torch.float32 else ""
+                )
+                methods.append(
+                    Method("normals", f"step {epsilon:.2g}", name, functools.partial(way, epsilon, dtype), judge, len(points), "°")
+                )
+    return methods
+
+
+def angles() -> list[Method]:
+    """The angle between two unit vectors, in float32."""
+    generator = torch.Generator().manual_seed(0)
+    a = torch.nn.functional.normalize(torch.randn(20000, 3, generator=generator, dtype=torch.float64), dim=1)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(a, torch.randn(20000, 3, generator=generator, dtype=torch.float64)), dim=1)
+    methods = []
+    for size in (1e-5, 1e-3, 0.5, math.pi - 1e-4):
+        b = math.cos(size) * a + math.sin(size) * aside
+        one, other = a.float(), b.float()
+        ways: tuple[tuple[str, Callable[[Tensor, Tensor], Tensor]], ...] = (
+            ("acos, clamped by 1e-6", lambda x, y: torch.acos((x * y).sum(1).clamp(-1 + 1e-6, 1 - 1e-6))),
+            ("atan2 (mmsynth)", lambda x, y: torch.atan2(torch.linalg.cross(x, y).norm(dim=1), (x * y).sum(1))),
+        )
+        for name, way in ways:
+            judge = lambda found, size=size: _typical(np.degrees((found.double() - size).abs().numpy()))
+            methods.append(Method("angles", f"{size:.5g} rad", name, functools.partial(way, one, other), judge, len(a), "°"))
+    return methods
+
+
+def _picture(height: int, width: int, channels: int) -> np.ndarray:
+    """(C, H, W) in [0, 1]: shading, texture and edges in all directions, box-filtered as by pixels."""
+    fine = 4
+    v, u = np.mgrid[: height * fine, : width * fine] / fine
+    out = np.empty((channels, height, width), np.float32)
+    for c in range(channels):
+        rings = 0.5 + 0.5 * np.sin(((u - 0.6 * width) ** 2 + (v - 0.4 * height) ** 2) / (3.0 * width) + 0.3 * c)
+        planes = np.where(np.sin(u / 9 + c) + np.cos(v / 7 - 0.5 * u / 9) > 0.3, 1.0, 0.45)
+        value = (0.15 + 0.6 * rings * planes) * (1.0 - 0.15 * c / channels)
+        out[c] = value.reshape(height, fine, width, fine).mean((1, 3))
+    return out
+
+
+def demosaicking() -> list[Method]:
+    """All channels from a mosaic, against the picture that it was taken of; of polarization also the false DoLP of unpolarized light."""
+    image = torch.from_numpy(_picture(240, 320, 3))
+    raw = mosaic(image, _RGGB)
+    codes = np.round(raw.numpy() * 65535).astype(np.uint16)
+
+    def judge(found: Any) -> dict[str, float]:
+        error = np.abs(np.asarray(found, dtype=np.float64) - image.numpy())[:, 4:-4, 4:-4]
+        return _typical(error) | {"psnr": -20 * math.log10(float(np.sqrt(np.mean(error**2))))}
+
+    by_opencv = lambda code: np.moveaxis(cv2.demosaicing(codes, code) / 65535.0, -1, 0)
+    ways: list[tuple[str, Callable[[], Any]]] = [
+        ("mmsynth, normalised convolution", lambda: demosaic(raw, _RGGB)),
+        ("mmsynth, edge-aware (OpenCV's)", lambda: demosaic_edge_aware(raw.numpy(), _RGGB)),
+        ("OpenCV, bilinear", lambda: by_opencv(cv2.COLOR_BayerBG2RGB)),
+        ("kornia, bilinear", lambda: kornia.color.raw_to_rgb(raw[None, None], kornia.color.CFA.BG)[0]),
+    ]
+    methods = [Method("demosaicking", "Bayer", name, run, judge, raw.numel(), "1") for name, run in ways]
+
+    light = torch.from_numpy(_picture(240, 320, 1))[0]
+    unpolarized = torch.stack([2 * light, 0 * light, 0 * light], -1)
+    frame = mosaic(stokes_to_intensities(unpolarized, _POL_ANGLES).movedim(-1, 0), _POL)
+
+    def superpixels() -> Tensor:
+        blocks = frame.reshape(120, 2, 160, 2).permute(0, 2, 1, 3).reshape(120, 160, 4)
+        return blocks[..., [3, 1, 0, 2]]  # the pattern's channels in order
+
+    def false_degree(found: Tensor) -> dict[str, float]:
+        return _typical(degree_of_linear_polarization(intensities_to_stokes(found, _POL_ANGLES)).numpy()[2:-2, 2:-2])
+
+    for name, run in (
+        ("mmsynth, normalised convolution", lambda: demosaic(frame, _POL).movedim(0, -1)),
+        ("superpixels of 2 x 2", superpixels),
+    ):
+        methods.append(Method("demosaicking", "false DoLP of unpolarized light", name, run, false_degree, frame.numel(), "1"))
+    return methods
+
+
+def resampling() -> list[Method]:
+    """A picture of polarization at twice its resolution: AoLP across all angles, judged where DoLP is 0.5."""
+    psi = lambda n: 180.0 * torch.from_numpy(np.add.outer((np.arange(n) + 0.5) / n, 2 * (np.arange(n) + 0.5) / n))
+    small, truth = psi(64), psi(128)
+    stokes = torch.stack([torch.ones_like(small), 0.5 * torch.cos(torch.deg2rad(2 * small)), 0.5 * torch.sin(torch.deg2rad(2 * small))], -1)
+    aolp = angle_of_linear_polarization(stokes)
+
+    def resize(images: Tensor, mode: str) -> Tensor:
+        return torch.nn.functional.interpolate(images[None], scale_factor=2, mode=mode, align_corners=False)[0]
+
+    def judge(found: Tensor) -> dict[str, float]:
+        return _typical(aolp_difference(found, truth).abs().numpy()[4:-4, 4:-4])
+
+    methods = []
+    for mode in ("bilinear", "bicubic"):
+        for name, run in (
+            ("of angles", functools.partial(lambda mode: resize(aolp[None], mode)[0], mode)),
+            (
+                "of Stokes vectors (mmsynth)",
+                functools.partial(lambda mode: angle_of_linear_polarization(resize(stokes.movedim(-1, 0), mode).movedim(0, -1)), mode),
+            ),
+        ):
+            methods.append(Method("resampling", mode, name, run, judge, truth.numel(), "°"))
+    return methods
+
+
+FAMILIES = (undistortion, opacity, normals, angles, demosaicking, resampling)
+
+
+# ------------------------------------------------------------------------------------------------------------------- the bench
+
+
+def bench_numerics(out: Path, only: Sequence[str] | None = None, repeats: int = REPEATS, progress: Progress | None = None) -> Report:
+    """Run all families, or those named in ``only``.
+
+    Raises:
+        InputError: an unknown name, or ``out`` cannot be written.
+    """
+    known = {family.__name__: family for family in FAMILIES}
+    for name in only or ():
+        if name not in known:
+            raise InputError(f"bench numerics: no family {name!r}, expected some of {', '.join(known)}.")
+    methods = [method for name, family in known.items() if only is None or name in only for method in family()]
+    rows = []
+    groups = _groups(methods)
+    threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        with use_threads(1):
+            for done, group in enumerate(groups, 1):
+                rows += _measured(group, repeats)
+                if progress is not None:
+                    progress(done, len(groups))
+    finally:
+        cv2.setNumThreads(threads)
+    results = {"bench": "numerics", "machine": measure(), "rows": rows, "repeats": repeats}
+    return write_report(results, tables_of(rows), plot(rows), out)
+
+
+def _groups(methods: Sequence[Method]) -> list[list[Method]]:
+    """Methods of one problem."""
+    groups: dict[tuple[str, str], list[Method]] = {}
+    for method in methods:
+        groups.setdefault((method.family, method.problem), []).append(method)
+    return list(groups.values())
+
+
+def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
+    times: list[list[float]] = [[] for _ in group]
+    judged = [method.judge(method.run()) for method in group]
+    for _ in range(repeats):
+        for method, taken in zip(group, times, strict=True):
+            began = time.perf_counter()
+            method.run()
+            taken.append(time.perf_counter() - began)
+    return [
+        {
+            "family": method.family, "problem": method.problem, "method": method.name, "unit": method.unit,
+            "ns": statistics.median(taken) / method.count * 1e9, **found,
+        }
+        for method, taken, found in zip(group, times, judged, strict=True)
+    ]  # fmt: skip
+
+
+def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """A table per family."""
+    columns = (
+        Column("problem", "problem"),
+        Column("method", "method"),
+        Column("ns", "ns", ".1f"),
+        Column("error", "error", ".1e"),
+        Column("worst", "worst", ".1e"),
+        Column("in", "unit"),
+        Column("wrong", "wrong", ".2%"),
+        Column("masked", "missing", ".2%"),
+        Column("PSNR [dB]", "psnr", ".2f"),
+    )
+    notes = {family.__name__: (family.__doc__ or "").split("\n")[0] for family in FAMILIES}
+    notes["undistortion"] += " Error: the median. Wrong: by more than 0.1 px, or behind the fold."
+    families = dict.fromkeys(row["family"] for row in rows)
+    return [Table(name.capitalize(), columns, [row for row in rows if row["family"] == name], notes[name]) for name in families]
+
+
+def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Error over ns per element, both log, a panel per family; ours filled."""
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    figure, axes = new_figure(len(families))
+    for one, family in zip(axes, families, strict=True):
+        here = [row for row in rows if row["family"] == family]
+        for i, method in enumerate(dict.fromkeys(row["method"] for row in here)):
+            points = [
+                (row["ns"], max(row["worst"], 1e-16))
+                for row in here
+                if row["method"] == method and math.isfinite(row.get("worst", math.inf))
+            ]
+            if points:
+                face = f"C{i % 10}" if "mmsynth" in method else "none"
+                x, y = zip(*points, strict=True)
+                one.scatter(x, y, s=24, facecolors=face, edgecolors=f"C{i % 10}", label=method)
+        one.set(xscale="log", yscale="log", xlabel="ns per element", ylabel=f"worst error [{here[0]['unit']}]", title=family)
+        one.legend(frameon=False, fontsize=7)
+    return figure

@@ -1,0 +1,130 @@
+"""Hard cases of lenses: what the usual inverse does, and the bound that ours keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mmsynth.sensors import lenses
+from mmsynth.sensors.camera import Camera, project, ray_map
+
+Row = Callable[[str, str, str], None]
+
+
+def _pixels(camera: Camera) -> np.ndarray:
+    return np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2).astype(np.float64)
+
+
+def _wide(k1: float, k2: float, degrees: float = 95.0) -> Camera:
+    focal = 80 / np.tan(np.radians(degrees / 2))
+    return Camera(161, 121, focal, focal, 80.0, 60.0, (k1, k2, 0.0, 0.0))
+
+
+def _error(ideal: np.ndarray, camera: Camera) -> np.ndarray:
+    """Distance [px] of the pixels from the forward model at their supposed ideal points, by OpenCV, as if f were 1000."""
+    points = np.concatenate([ideal, np.ones_like(ideal[:, :1])], 1)
+    back = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, camera.coefficients)[0][:, 0]
+    return np.linalg.norm(back - _pixels(camera), axis=1) * 1000 / camera.fx
+
+
+def _newton(camera: Camera) -> np.ndarray:
+    """Ten Newton steps from the distorted point, no residual check: nerfstudio's and MultimodalStudio's."""
+    k = torch.from_numpy(camera.coefficients)
+    target = (torch.from_numpy(_pixels(camera)) - torch.tensor([camera.cx, camera.cy])) / camera.fx
+    point = target.clone()
+    for _ in range(10):
+        jacobian = lenses.distort_jacobian(point, k)
+        safe = torch.linalg.det(jacobian).abs() > 1e-3
+        step = torch.linalg.solve(jacobian + 0 * target[:, :, None], (target - lenses.distort(point, k))[..., None])[..., 0]
+        point = torch.where(safe[:, None], point + step, point)
+    return point.numpy()
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(-0.28, 0.07), (0.5, 0.0), (-0.5, 0.25)])
+def test_undistortion_far_from_the_centre(row: Row, k1: float, k2: float) -> None:
+    camera = _wide(k1, k2)
+    pixels = _pixels(camera)
+    theirs = _error(cv2.undistortPoints(pixels[:, None], camera.matrix, camera.coefficients)[:, 0], camera)
+    newton = _error(_newton(camera), camera)
+    directions, valid = (x.reshape(len(pixels), -1) for x in ray_map(camera))
+    valid = valid[:, 0]
+    ours = _error(directions[:, :2] / directions[:, 2:], camera)
+    wrong = theirs[valid] > 0.1
+    assert wrong.mean() > 0.02  # the usual way is wrong where ours is not
+    assert valid.mean() > 0.9 and ours[valid].max() < 1e-3
+    row(
+        f"undistortion, 95° across, k1 = {k1}, k2 = {k2}",
+        f"OpenCV, kornia (5 iterations): {wrong.mean():.0%} of the pixels wrong by more than 0.1 px, up to {theirs[valid].max():.2g} px; "
+        f"Newton, 10 steps, unchecked: up to {newton[valid].max():.2g} px",
+        f"{ours[valid].max():.1g} px on {valid.mean():.1%} of the pixels, the others masked",
+    )
+
+
+@pytest.mark.parametrize("k1", [-0.4, -0.25])
+def test_pixels_beyond_the_fold_of_a_lens(row: Row, k1: float) -> None:
+    """No ray reaches them. The usual inverses answer with numbers."""
+    camera = Camera(161, 161, 60.0, 60.0, 80.0, 80.0, (k1, 0.0, 0.0, 0.0))
+    radius = np.sqrt(-1 / (3 * k1))
+    reach = radius + k1 * radius**3
+    pixels = _pixels(camera)
+    beyond = np.linalg.norm((pixels - 80) / 60, axis=1) > reach
+    theirs = cv2.undistortPoints(pixels[:, None], camera.matrix, camera.coefficients)[:, 0]
+    off = np.nanmedian(_error(theirs, camera)[beyond])
+    _, valid = ray_map(camera)
+    assert beyond.mean() > 0.2 and np.isfinite(theirs[beyond]).mean() > 0.5
+    assert not valid.reshape(-1)[beyond].any() and valid.reshape(-1)[~beyond].mean() > 0.999
+    row(
+        f"{beyond.mean():.0%} of the pixels beyond the fold, k1 = {k1}",
+        f"OpenCV, kornia: a finite ray for {np.isfinite(theirs[beyond]).mean():.0%} of them, off by {off:.2g} px (median)",
+        "all masked, and none but them",
+    )
+
+
+def test_points_behind_the_fold_are_not_seen(row: Row) -> None:
+    """A point at 60 degrees falls back into the picture of a lens that folds at 42."""
+    camera = Camera(161, 161, 60.0, 60.0, 80.0, 80.0, (-0.4, 0.0, 0.0, 0.0))
+    point = np.array([[np.tan(np.radians(60)), 0.0, 1.0]])
+    theirs = cv2.projectPoints(point, np.zeros(3), np.zeros(3), camera.matrix, camera.coefficients)[0][0, 0]
+    assert (theirs >= 0).all() and (theirs < 161).all()
+    assert np.isnan(project(point, camera)).all()
+    row("a point at 60° before a lens that folds at 42°", f"projected into the picture, at column {theirs[0]:.0f}", "not seen")
+
+
+def test_tangential_terms_keep_their_place(row: Row) -> None:
+    """File order is k1 k2 p1 p2 k3 k4; read as k1 k2 k3 k4 p1 p2, tangential distortion becomes radial."""
+    right = Camera(2592, 1944, 2300.0, 2300.0, 1295.5, 971.5, (-0.1, 0.08, 1e-3, -8e-4, 0.0, 0.0))
+    swapped = Camera(2592, 1944, 2300.0, 2300.0, 1295.5, 971.5, (-0.1, 0.08, 0.0, 0.0, 1e-3, -8e-4))
+    points = np.random.default_rng(0).uniform((-0.55, -0.42, 1), (0.55, 0.42, 1), (5000, 3))
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), right.matrix, np.array(right.distortion[:4]))[0][:, 0]
+    wrong = np.linalg.norm(project(points, swapped) - expected, axis=1).max()
+    ours = np.linalg.norm(project(points, right) - expected, axis=1).max()
+    assert wrong > 3 and ours < 1e-9
+    row("distortion order k1 k2 p1 p2 k3 k4, 5 MP", f"MultimodalStudio reads k1 k2 k3 k4 p1 p2: up to {wrong:.1f} px", f"{ours:.0e} px")
+
+
+def test_a_fisheye_sees_beside_and_behind_itself(row: Row) -> None:
+    """At 90 degrees off the axis x / z is infinite, behind it has the wrong sign."""
+    camera = Camera(201, 201, 50.0, 50.0, 100.0, 100.0, (0.01, 0.0, 0.0, 0.0), "kannala_brandt")
+    directions, valid = ray_map(camera)
+    assert valid[100, 0] and directions[100, 0, 2] < 0
+    back = project(directions[valid], camera)
+    assert np.abs(back - _pixels(camera)[valid.reshape(-1)]).max() < 1e-6
+    theirs = cv2.fisheye.undistortPoints(np.array([[[0.0, 100.0]]]), camera.matrix, camera.coefficients)[0, 0]
+    assert theirs[0] > 0 or not np.isfinite(theirs).all() or abs(theirs[0]) > 10  # no finite x / z is that ray
+    row(
+        "fisheye, 108° off the axis", f"OpenCV's point before the lens: x / z = {theirs[0]:.3g}",
+        f"a ray with z = {directions[100, 0, 2]:.2f}, back to {np.abs(back - _pixels(camera)[valid.reshape(-1)]).max():.0e} px",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [(32, 1), (1, 24), (1, 1)])
+def test_pictures_of_one_row_or_column_or_pixel(row: Row, size: tuple[int, int]) -> None:
+    camera = Camera(*size, 30.0, 30.0, (size[0] - 1) / 2, (size[1] - 1) / 2, (-0.1, 0.02, 1e-3, 1e-3))
+    directions, valid = ray_map(camera)
+    assert directions.shape == (size[1], size[0], 3) and valid.all()
+    np.testing.assert_allclose(project(directions, camera).reshape(-1, 2), _pixels(camera), atol=1e-9)
+    row(f"a picture of {size[0]} x {size[1]}", "`.squeeze()` drops an axis", "its rays, as of any other")
