@@ -32,10 +32,11 @@ from torch import Tensor
 STEEPEST = math.radians(80.0)  # off axis: no Brown-Conrady lens sees farther
 WIDEST = math.pi  # off axis: all that a fisheye could see
 _TABLE = 1025
-_ITERATIONS = 30
+_ITERATIONS, _ALL = 30, 4  # of Newton's method; how many all points take: from the table most need three
+_AT_REST = 1e-13  # the step of a point that has arrived
 _TOLERANCE = 1e-10  # of the residual, at unit focal length
 _STEP = 0.25  # the most that Newton's method moves at once: it stays on its branch
-_ALONG = torch.linspace(0.125, 1.0, 8, dtype=torch.float64)  # where a ray's way from the axis is looked at for folds
+_ALONG = (0.25, 0.5, 0.75, 1.0)  # where a ray's way from the axis is looked at for folds
 
 
 def _radial(r2: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,7 +70,7 @@ def distort_jacobian(xy: Tensor, k: Tensor) -> Tensor:
 
 
 def fold_radius(k: Tensor) -> Tensor:
-    """Ideal radius up to which the radial profile of Brown-Conrady lenses rises, (..., 8) → (...); at most tan 80°."""
+    """Ideal radius up to which the radial profile of Brown-Conrady lenses rises, (..., 8) → (...); at most tan 80°, ∞ of a pinhole."""
     k = k.detach()
 
     def slope(angle: Tensor) -> Tensor:
@@ -77,7 +78,7 @@ def fold_radius(k: Tensor) -> Tensor:
         radial, d = _radial(r2, k[..., None, :])
         return radial + 2 * r2 * d
 
-    return torch.tan(_first_fall(slope, STEEPEST, k))
+    return torch.where((k != 0).any(-1), torch.tan(_first_fall(slope, STEEPEST, k)), torch.inf)
 
 
 def undistort(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
@@ -90,30 +91,51 @@ def undistort(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
     """
     with torch.no_grad():
         target, lens = xy.double(), k.double()
-        limit = fold_radius(lens)
-        angles = torch.linspace(0.0, 1.0, _TABLE, dtype=torch.float64, device=k.device) * torch.atan(limit)[..., None]
-        radii = torch.tan(angles)
-        profile = radii * _radial(radii * radii, lens[..., None, :])[0]
-        distance = torch.linalg.vector_norm(target, dim=-1)
-        start = _interpolate(distance, profile, radii)
-        point = target * (start / distance.clamp(min=1e-300))[..., None]
-        for _ in range(_ITERATIONS):
-            step = _solve(distort_jacobian(point, lens), target - distort(point, lens))
-            length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
-            point = point + step * (_STEP / length.clamp(min=_STEP))
-            if not bool((length > 1e-14).any()):
-                break
-        close = torch.linalg.vector_norm(target - distort(point, lens), dim=-1) < _TOLERANCE
-        valid = close & (torch.linalg.vector_norm(point, dim=-1) <= limit[..., None])
-        for share in _ALONG.tolist():  # tangential terms may fold, too: the orientation holds all the way from the axis
-            j = distort_jacobian(share * point, lens)
-            valid &= j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0] > 0
+        if not bool(lens.any()):
+            point, valid = target.clone(), torch.isfinite(target).all(-1)
+        else:
+            point, valid = _undistorted(target, lens)
         point = torch.where(valid[..., None], point, 0.0).to(xy.dtype)
-        jacobian = distort_jacobian(point, k)
     if xy.requires_grad or k.requires_grad:
-        onward = _solve(jacobian, torch.where(valid[..., None], xy - distort(point, k), 0.0))
+        onward = _solve(distort_jacobian(point, k.detach()), torch.where(valid[..., None], xy - distort(point, k), 0.0))
         point = point + onward - onward.detach()
     return point, valid
+
+
+def _undistorted(target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
+    limit = fold_radius(lens)
+    angles = torch.linspace(0.0, 1.0, _TABLE, dtype=torch.float64, device=lens.device) * torch.atan(limit).clamp(max=STEEPEST)[..., None]
+    radii = torch.tan(angles)
+    profile = radii * _radial(radii * radii, lens[..., None, :])[0]
+    distance = torch.linalg.vector_norm(target, dim=-1)
+    start = torch.where(torch.isinf(limit)[..., None], distance, _interpolate(distance, profile, radii))
+    point = target * (start / distance.clamp(min=1e-300))[..., None]
+    for _ in range(_ALL):
+        point, length = _newton(point, target, lens)
+    # most have come to rest; of the others, those that are not far beyond the reach of the lens go on
+    index = torch.nonzero((length > _AT_REST) & (distance < 1.5 * profile[..., -1:]), as_tuple=True)
+    if len(index[0]):
+        some, aim = point[index][:, None], target[index][:, None]
+        lenses = lens[..., None, :].expand(*target.shape[:-1], lens.shape[-1])[index]
+        for _ in range(_ITERATIONS - _ALL):
+            some, length = _newton(some, aim, lenses)
+            if not bool((length > _AT_REST).any()):
+                break
+        point[index] = some[:, 0]
+    close = torch.linalg.vector_norm(target - distort(point, lens), dim=-1) < _TOLERANCE
+    valid = close & (torch.linalg.vector_norm(point, dim=-1) <= limit[..., None])
+    if bool(lens[..., 2:4].any()):  # tangential terms may fold, too: the orientation holds all the way from the axis
+        for share in _ALONG:
+            j = distort_jacobian(share * point, lens)
+            valid &= j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0] > 0
+    return point, valid
+
+
+def _newton(point: Tensor, target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
+    """The next point and how far it was, (..., N)."""
+    step = _solve(distort_jacobian(point, lens), target - distort(point, lens))
+    length = torch.linalg.vector_norm(step, dim=-1)
+    return point + step * (_STEP / length.clamp(min=_STEP))[..., None], length
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:

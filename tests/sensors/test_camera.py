@@ -166,6 +166,17 @@ def test_undistorted_camera_is_a_pinhole() -> None:
     np.testing.assert_allclose(rays, np.array([[-0.75, -0.25, 1.0], [0.0, 0.0, 1.0]]) / [[np.sqrt(1 + 0.625)], [1.0]])
 
 
+def test_a_pinhole_sees_up_to_its_side() -> None:
+    camera = Camera(201, 201, 5.0, 5.0, 100.0, 100.0)
+    directions, valid = ray_map(camera)
+    assert valid.all() and directions[100, 0, 2] < np.cos(np.radians(87))
+    np.testing.assert_allclose(project(directions, camera), _pixels(camera), atol=1e-9)
+    batch = torch.zeros(2, 8, dtype=torch.float64)
+    batch[1, 0] = -0.1  # beside a lens that bends
+    ideal, seen = lenses.undistort(torch.tensor([[[20.0, 0.0]], [[0.2, 0.1]]], dtype=torch.float64), batch)
+    assert seen.all() and ideal[0, 0].tolist() == [20.0, 0.0]
+
+
 def test_pixels_that_are_not_finite_have_no_ray() -> None:
     for camera in (RIG, FISHEYE, Camera(4, 3, 2.0, 4.0, 1.5, 1.0)):
         directions, valid = unproject(np.array([[np.nan, 1.0], [np.inf, 0.0], [1.0, 1.0]]), camera)
