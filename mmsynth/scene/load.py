@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from mmsynth.scene.middlebury import read_middlebury
 from mmsynth.scene.mmsdata import read_mmsdata
 from mmsynth.scene.nerfstudio import read_nerfstudio
 from mmsynth.scene.scene import Frame, Region, Scene
-from mmsynth.sensors.camera import project, unproject
+from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
+
+_ROUND_TRIP = 1e-3  # pixels
 
 
 def load_scene(path: Path | str, modalities: Sequence[str] | None = None) -> Scene:
@@ -33,7 +36,7 @@ def load_scene(path: Path | str, modalities: Sequence[str] | None = None) -> Sce
     training = [frame for frame in scene.frames if frame.view in scene.split.train]
     if len(training) < 2:
         raise InputError(f"{path}: {len(training)} frames to train on ({len(scene.frames)} in all), expected at least 2.")
-    problems = list(scene.problems)
+    problems = [*scene.problems, *_lens_problems(scene)]
     for name in scene.sensors:
         if not any(frame.sensor == name for frame in training):
             problems.append(f"{name}: none of its frames is in a training view.")
@@ -78,9 +81,7 @@ def sees(frame: Frame, region: Region) -> bool:
     centre = to_camera[:3, :3] @ np.asarray(region.centre) + to_camera[:3, 3]
     if np.linalg.norm(centre) <= region.radius:
         return True  # the camera is inside
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
-    directions, valid = unproject(np.stack([u, v], -1).reshape(-1, 2), camera)
-    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions, valid = _looks(camera)
     along = directions @ centre
     hit = valid & (along > 0) & (centre @ centre - along**2 <= region.radius**2)
     if hit.any():
@@ -88,6 +89,30 @@ def sees(frame: Frame, region: Region) -> bool:
     # a region smaller than the spacing of the rays
     pixel = project(centre, camera)
     return bool(np.all(pixel >= -0.5) and np.all(pixel <= np.array([camera.width, camera.height]) - 0.5))
+
+
+def _grid(camera: Camera) -> np.ndarray:
+    """(81, 2) pixels: 9x9 over the frame, corners included."""
+    return np.stack(np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9)), -1).reshape(-1, 2)
+
+
+@functools.lru_cache(maxsize=256)
+def _looks(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of the grid: unit directions (81, 3) and whether the lens has them."""
+    return unproject(_grid(camera), camera)
+
+
+def _lens_problems(scene: Scene) -> list[str]:
+    """A sentence for every sensor whose lens model has no ray for a part of its pictures, or rays that do not come back."""
+    errors: dict[str, float] = {}
+    lost: dict[str, float] = {}
+    for sensor, camera in dict.fromkeys((frame.sensor, frame.camera) for frame in scene.frames):
+        error, missing = round_trip_error(camera, _grid(camera))
+        errors[sensor], lost[sensor] = max(errors.get(sensor, 0.0), error), max(lost.get(sensor, 0.0), missing)
+    found = [
+        f"{n}: the lens model has no ray for about {share:.0%} of the pixels; they are not used." for n, share in lost.items() if share
+    ]
+    return found + [f"{n}: rays come back {e:.1g} pixels from where they began." for n, e in errors.items() if e > _ROUND_TRIP]
 
 
 def _rounded(point: tuple[float, float, float]) -> str:

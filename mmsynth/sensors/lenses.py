@@ -199,6 +199,8 @@ def _first_fall(slope: Callable[[Tensor], Tensor], most: float, k: Tensor) -> Te
     """Where a profile's slope (of (..., M) angles) is first not positive, (...); ``most`` where it is up to there."""
     angles = torch.linspace(0.0, most, 4 * _TABLE, dtype=k.dtype, device=k.device).expand(*k.shape[:-1], 4 * _TABLE)
     falls = ~(slope(angles) > 0)
+    if not bool(falls.any()):
+        return torch.full(k.shape[:-1], most, dtype=k.dtype, device=k.device)
     first = falls.int().argmax(-1, keepdim=True)
     low, high = angles.gather(-1, (first - 1).clamp(min=0)), angles.gather(-1, first)
     for _ in range(60):

@@ -36,10 +36,16 @@ def around(count: int, distance: float = 2.6) -> list[np.ndarray]:
     return [look_from((distance * np.cos(a), distance * np.sin(a), 0.5 + 0.6 * (i % 3))) for i, a in enumerate(angles)]
 
 
-def picture(pose: np.ndarray, scale: float = 1.0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """(H, W, 3) linear: the ball, ``scale`` times as large, on black."""
+def picture(pose: np.ndarray, scale: float = 1.0, width: int = WIDTH, height: int = HEIGHT, fisheye: bool = False) -> np.ndarray:
+    """(H, W, 3) linear: the ball, ``scale`` times as large, on black. A fisheye's r = f θ holds from side to side."""
     v, u = np.mgrid[:height, :width]
-    local = np.stack([(u - (width - 1) / 2) / FOCAL, -(v - (height - 1) / 2) / FOCAL, -np.ones_like(u, float)], -1)
+    x, y = (u - (width - 1) / 2) / FOCAL, -(v - (height - 1) / 2) / FOCAL
+    if fisheye:
+        angle = np.hypot(x, y)
+        across = np.sinc(angle / np.pi)
+        local = np.stack([x * across, y * across, -np.cos(angle)], -1)
+    else:
+        local = np.stack([x, y, -np.ones_like(x)], -1)
     d = local @ pose[:3, :3].T
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     o = pose[:3, 3] / scale
@@ -58,13 +64,14 @@ def write_scene(
     size: tuple[int, int] = (WIDTH, HEIGHT),
     alter: dict[str, Any] | None = None,
     file_type: str = "png",
+    fisheye: bool = False,
 ) -> Path:
     """A transforms.json of modalities ``rgb`` (three channels) or any other (one); ``alter[modality]`` changes its pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for name, places in poses.items():
         for i, pose in enumerate(places):
-            image = picture(pose, scale, *size)
+            image = picture(pose, scale, *size, fisheye)
             image = image if name == "rgb" else image.mean(-1)
             image = (alter or {}).get(name, lambda x: x)(image).astype(np.float32)
             path = folder / f"{name}_{i:03}.{file_type}"
@@ -75,5 +82,6 @@ def write_scene(
                 cv2.imwrite(str(path), stored if stored.ndim == 2 else stored[..., [2, 1, 0, *range(3, stored.shape[2])]])
             frames.append({"file_path": path.name, "modality": name, "view": i, "transform_matrix": pose.tolist()})
     intrinsics = {"w": size[0], "h": size[1], "fl_x": FOCAL, "fl_y": FOCAL, "cx": size[0] / 2, "cy": size[1] / 2}
-    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+    lens = {"camera_model": "OPENCV_FISHEYE"} if fisheye else {}
+    (folder / "transforms.json").write_text(json.dumps({**intrinsics, **lens, "frames": frames}))
     return folder

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_scenes import QUICK, around, look_from, write_scene
+from small_scenes import FOCAL, HEIGHT, QUICK, RADIUS, around, look_from, picture, write_scene
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
@@ -168,6 +168,35 @@ def test_cameras_inside_the_region(row: Row, tmp_path: Path) -> None:
         "no interval, or near = far = 0.01: black",
         f"fitted, {field.manifest['train_psnr']['rgb']:.1f} dB",
     )
+
+
+def test_a_fisheye_that_sees_beside_itself(row: Row, tmp_path: Path) -> None:
+    """220 degrees across: half of its picture has no pinhole. The ball fills the middle."""
+    near = around(8, 1.4)
+    size = (2 * round(math.radians(110) * FOCAL), HEIGHT)
+    field = _fit(tmp_path, {"rgb": near}, steps=150, size=size, fisheye=True)
+    scene = load_scene(tmp_path / "scene")
+    frame = scene.frames_of("rgb", scene.split.test)[0]
+    seen = field.render(frame.camera, frame.camera_to_world)
+    ball = picture(near[frame.view], 1.0, *size, fisheye=True).any(-1)
+    assert frame.camera.lens == "kannala_brandt" and seen.valid.all()
+    agree = float(np.mean((seen.opacity > 0.5) == ball))
+    depth = float(np.nanmedian(np.abs(seen.depth_ray - _distance(near[frame.view], size))[ball]))
+    assert agree > 0.95 and depth < 0.1
+    row(
+        "a fisheye of 220°", "tan θ: infinite at 90°, a wrong side behind", f"{agree:.1%} of the silhouette, depth within {depth:.2f} radii"
+    )
+
+
+def _distance(pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) along the fisheye's rays to the ball, NaN beside it."""
+    x = (np.arange(size[0]) - (size[0] - 1) / 2)[None, :] / FOCAL
+    y = -(np.arange(size[1]) - (size[1] - 1) / 2)[:, None] / FOCAL
+    angle = np.hypot(x, y)
+    d = np.stack(np.broadcast_arrays(x * np.sinc(angle / np.pi), y * np.sinc(angle / np.pi), -np.cos(angle)), -1) @ pose[:3, :3].T
+    b = d @ pose[:3, 3]
+    inside = b**2 - (pose[:3, 3] @ pose[:3, 3] - RADIUS**2)
+    return np.where(inside > 0, -b - np.sqrt(np.maximum(inside, 0)), np.nan)
 
 
 # --- rotations

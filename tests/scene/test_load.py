@@ -110,7 +110,19 @@ def test_describe_counts_pixels_without_a_ray(write_mmsdata: Writer) -> None:
     def fold(meta: dict[str, Any]) -> None:
         meta["modalities"]["rgb"]["distortion_params"] = [-1.5, 0, 0, 0, 0, 0]
 
-    assert 0 < describe(load_scene(write_mmsdata(edit=fold)))["sensors"]["rgb"]["invalid_lens_pixels"] < 24 * 18
+    description = describe(load_scene(write_mmsdata(edit=fold)))
+    rgb = description["sensors"]["rgb"]
+    assert 0 < rgb["invalid_lens_pixels"] < 24 * 18 and rgb["round_trip_px"] < 1e-3 and rgb["lens"] == "brown_conrady"
+    (problem,) = description["problems"]
+    assert problem.startswith("rgb: the lens model has no ray for about")
+    text = render_text(description)
+    assert f"{rgb['invalid_lens_pixels']} pixels" in text and "rays come back to their pixels within" in text
+
+
+def test_rays_that_do_not_come_back_are_a_problem(write_mmsdata: Writer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mmsynth.scene.load.round_trip_error", lambda camera, pixels: (0.25, 0.0))
+    problems = load_scene(write_mmsdata()).problems
+    assert "rgb: rays come back 0.2 pixels from where they began." in problems and len(problems) == 2
 
 
 def test_describe_suspects_right_aligned_data(write_mmsdata: Writer) -> None:
