@@ -10,7 +10,7 @@ analyser with transmission axis e ⟂ ray is I = eᵀ J e, and
 
 Angles of polarization (AoLP) are for display and for metrics: what is averaged, resampled or learned is S or intensities. A
 picture that is flipped or turned, or resampled into another camera, has its Stokes vectors in another frame: see ``flip_stokes``,
-``rotate_stokes``, ``frame_angle``.
+``rotate_stokes``, ``resample_stokes``.
 """
 
 from __future__ import annotations
@@ -184,6 +184,21 @@ def frame_angle(x: Tensor, y: Tensor, to_x: Tensor) -> Tensor:
 def flip_stokes(stokes: Tensor) -> Tensor:
     """Stokes of a picture that was mirrored, left to right or top to bottom: the pixels are moved by the caller, S2 turns its sign."""
     return stokes * stokes.new_tensor([1.0, 1.0, -1.0])
+
+
+def resample_stokes(image: Tensor, pixels: Tensor, turn: Tensor) -> Tensor:
+    """A picture of Stokes vectors as another camera has it, bilinear.
+
+    Args:
+        image: (B, 3, H, W). pixels: (B, H', W', 2) where in it each new pixel looks, column and row, centres at integers.
+        turn: (B, H', W') [rad] from the image's x̂ towards its ŷ to the new pixel's x̂, see ``frame_angle``.
+    Returns:
+        (B, 3, H', W'), 0 (no light) outside of the image. Differentiable.
+    """
+    size = pixels.new_tensor([image.shape[-1], image.shape[-2]])
+    grid = (2.0 * pixels + 1.0) / size - 1.0
+    found = torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return rotate_stokes(found.movedim(1, -1), turn).movedim(-1, 1)
 
 
 # --- degree and angle

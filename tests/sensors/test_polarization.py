@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,7 @@ from mmsynth.sensors.polarization import (
     frame_angle,
     intensities_to_stokes,
     reference_axes,
+    resample_stokes,
     rotate_stokes,
     stokes_to_coherency,
     stokes_to_intensities,
@@ -216,6 +218,44 @@ def test_a_picture_turned_by_a_quarter_has_angles_turned_by_a_quarter() -> None:
     turned = rotate_stokes(torch.rot90(stokes, 1), torch.tensor(-math.pi / 2, dtype=torch.float64))
     expected = torch.rot90(angle_of_linear_polarization(stokes), 1) + 90.0
     assert aolp_difference(angle_of_linear_polarization(turned), expected).abs().max() < 1e-9
+
+
+def test_a_rolled_camera_sees_the_same_light() -> None:
+    """A camera turned by 30 degrees about its axis: pictures of one field of light, one resampled into the other."""
+    turn, n = math.radians(30.0), 41
+    axis = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
+    v, u = torch.meshgrid(axis, axis, indexing="ij")
+
+    def light(right: Tensor, up: Tensor) -> Tensor:
+        """(..., 3) of a frame along right and up, smooth in space."""
+        psi, p = 0.02 * right + 0.01 * up, 0.4 + 0.005 * right
+        return torch.stack([torch.ones_like(psi), p * torch.cos(2 * psi), p * torch.sin(2 * psi)], -1)
+
+    level = light(u, -v)
+    # the second camera's x axis stands at `turn`, from right towards up: its pixels (u, v) look at
+    right, up = u * math.cos(turn) + v * math.sin(turn), u * math.sin(turn) - v * math.cos(turn)
+    expected = rotate_stokes(light(right, up), torch.tensor(turn, dtype=torch.float64))
+    pixels = torch.stack([right, -up], -1) + (n - 1) / 2
+    found = resample_stokes(level.movedim(-1, 0)[None], pixels[None], torch.full((1, n, n), turn, dtype=torch.float64))[0].movedim(0, -1)
+    inside = ((pixels >= 0) & (pixels <= n - 1)).all(-1)
+    assert 0.6 < inside.double().mean() < 0.95
+    torch.testing.assert_close(found[inside], expected[inside], atol=1e-3, rtol=0)
+    outside = ((pixels < -1) | (pixels > n)).any(-1)
+    assert not found[outside].any()
+    moved_alone = aolp_difference(angle_of_linear_polarization(found), angle_of_linear_polarization(light(right, up)))[inside]
+    assert (moved_alone.abs() - 30.0).abs().max() < 0.5  # what is not turned is off by the roll
+    angle = torch.zeros(1, 3, 3, dtype=torch.float64, requires_grad=True)
+    small = torch.rand(1, 3, 4, 5, dtype=torch.float64, requires_grad=True)
+    where = (torch.rand(1, 3, 3, 2, dtype=torch.float64) * 2.7 + 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(resample_stokes, (small, where, angle))
+
+
+def test_resampling_equals_opencv() -> None:
+    image = torch.rand(1, 3, 12, 17)
+    pixels = torch.rand(1, 9, 8, 2) * torch.tensor([16.0, 11.0])
+    ours = resample_stokes(image, pixels, torch.zeros(1, 9, 8))[0]
+    theirs = cv2.remap(image[0].movedim(0, -1).numpy(), pixels[0].numpy(), None, cv2.INTER_LINEAR)
+    np.testing.assert_allclose(ours.movedim(0, -1), theirs, atol=0.03)  # OpenCV rounds where it looks to 1/32 pixel
 
 
 # --- degree and angle
