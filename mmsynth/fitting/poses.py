@@ -127,11 +127,15 @@ def motion_of(matrix: np.ndarray) -> np.ndarray:
     return np.concatenate([Rotation.from_matrix(matrix[:, :3, :3]).as_rotvec(), matrix[:, :3, 3]], 1)
 
 
+def in_world(layout: Layout, motions: Motions) -> np.ndarray:
+    """(V, 4, 4) motions of the views, in the normalised frame and no longer in the axes of their anchors."""
+    anchors = layout.poses[layout.anchor]
+    return anchors @ rigid(motions.views) @ np.linalg.inv(anchors)
+
+
 def moved(layout: Layout, motions: Motions) -> np.ndarray:
     """(F, 4, 4) camera_to_world of all frames after the motions of their views and sensors."""
-    anchors = layout.poses[layout.anchor]
-    in_world = anchors @ rigid(motions.views) @ np.linalg.inv(anchors)
-    return in_world[layout.view] @ layout.poses @ rigid(motions.sensors)[layout.sensor]
+    return in_world(layout, motions)[layout.view] @ layout.poses @ rigid(motions.sensors)[layout.sensor]
 
 
 def derivative(rows: Rows, rotations: Tensor) -> Tensor:

@@ -135,8 +135,7 @@ class Refinement:
         """The motions in the scene's frame and unit; those of sensors and views that have none are left out."""
         layout, radius = self.layout, self.region.radius
         centre = np.array(self.region.centre)
-        anchors = layout.poses[layout.anchor]
-        in_world = anchors @ poses.rigid(self.motions.views) @ np.linalg.inv(anchors)
+        in_world = poses.in_world(layout, self.motions)
         # x_world = radius x + centre, so x → R x + t there is x_world → R x_world + radius t + centre - R centre
         in_world[:, :3, 3] = radius * in_world[:, :3, 3] + centre - in_world[:, :3, :3] @ centre
         in_sensor = poses.rigid(self.motions.sensors)
