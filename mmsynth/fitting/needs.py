@@ -15,6 +15,7 @@ import numpy as np
 from mmsynth.field.field import Design
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.tables import rows_log2
 from mmsynth.scene.scene import Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
@@ -108,12 +109,19 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     evidence["scarce"] = f"on: {frames}: learned from the geometry of the others" if scarce else "off: all modalities have enough pixels"
     pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
     evidence["tensor_head"] = f"on: {', '.join(pol)}; costs six outputs each" if pol else "off: no polarization sensor"
+    surface_rows, radiance_rows = recipe.surface_rows_log2, recipe.radiance_rows_log2
+    if recipe.tables_at == 0:
+        evidence["tables"] = f"2^{surface_rows} and 2^{radiance_rows} rows a level: asked for by the recipe"
+    else:
+        # a row that few rays meet is noise, and costs as much as any other
+        surface_rows = rows_log2(rays_to_come / (2.0 * recipe.rays_per_row), surface_rows)
+        radiance_rows = rows_log2(rays_to_come / recipe.rays_per_row, radiance_rows)
     design = Design(
         surface_levels=recipe.surface_levels,
-        surface_rows_log2=recipe.surface_rows_log2,
+        surface_rows_log2=surface_rows,
         surface_finest=surface_finest,
         radiance_levels=recipe.radiance_levels,
-        radiance_rows_log2=recipe.radiance_rows_log2,
+        radiance_rows_log2=radiance_rows,
         radiance_finest=radiance_finest,
         background=background,
         beyond=beyond,
@@ -123,8 +131,6 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         occupancy=recipe.occupancy_resolution,
         initial_radius=radius,
     )
-    if recipe.tables_at == 0:
-        evidence["tables"] = f"2^{design.surface_rows_log2} and 2^{design.radiance_rows_log2} rows a level: asked for by the recipe"
     black = not background and outside >= 0.005
     sharpness = recipe.sharpness_end * min(1.0, seen_enough / finest) / footprint
     return Needs(design, footprint, max(sharpness, 2 * recipe.sharpness_start), black, scarce, share, evidence)

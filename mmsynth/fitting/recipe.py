@@ -28,6 +28,9 @@ class Recipe(BaseModel):
     surface_cells: float = Field(2.0, gt=0, description="finest surface grid: cells per two pixel footprints")
     radiance_cells: float = Field(4.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
     cells_per_row: float = Field(3.0, gt=0, description="cells of the finest level at the surface that share a row of its hash table")
+    rays_per_row: float = Field(
+        50.0, gt=0, description="rays of the fit for each row of a level of the radiance's tables; half the rows for the surface's"
+    )
     tables_at: float = Field(
         0.05,
         ge=0,

@@ -33,6 +33,6 @@ def cells_at_surface(field: Field, active: int, generator: torch.Generator) -> t
     return count(grid.cell(len(grid.resolutions))), count(field.appearance.cell(len(field.appearance.resolutions)))
 
 
-def rows_log2(cells: float, cells_per_row: float, most: int) -> int:
-    """log2 of a level's rows: the nearest power of two, at least 2^12, at most 2^most."""
-    return min(most, max(_LEAST, round(math.log2(max(cells / cells_per_row, 1.0)))))
+def rows_log2(wanted: float, most: int) -> int:
+    """log2 of a level's rows: the power of two nearest to ``wanted``, at least 2^12, at most 2^most."""
+    return min(most, max(_LEAST, round(math.log2(max(wanted, 1.0)))))

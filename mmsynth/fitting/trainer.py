@@ -217,16 +217,19 @@ class Trainer:
 
     def _size_tables(self, sampling: rendering.Sampling, generator: torch.Generator) -> None:
         """Give the levels of the hash tables that are not yet active rows for the cells at the surface, as it is now."""
-        recipe = self.recipe
+        recipe, design = self.recipe, self.needs.design
         cells = cells_at_surface(self.field, sampling.active_surface, generator)
-        rows = [rows_log2(cells[0], recipe.cells_per_row, recipe.surface_rows_log2)]
-        rows += [rows_log2(cells[1], recipe.cells_per_row, recipe.radiance_rows_log2)]
-        evidence = ", ".join(f"{what} 2^{r} for {n:.2g} cells" for what, r, n in zip(("surface", "radiance"), rows, cells, strict=True))
+        names, active = ("surface", "radiance"), (sampling.active_surface, sampling.active_radiance)
+        levels = recipe.surface_levels, recipe.radiance_levels
+        most = int(design.surface_rows_log2), int(design.radiance_rows_log2)  # type: ignore[arg-type]
+        rows = [rows_log2(n / recipe.cells_per_row, m) for n, m in zip(cells, most, strict=True)]
+        evidence = ", ".join(
+            f"{name} 2^{r} for {n:.2g} cells" + (" (by the rays to come or the recipe no more)" if r == m else "")
+            for name, r, m, n in zip(names, rows, most, cells, strict=True)
+        )
         self.state.tables = {
-            "surface": [recipe.surface_rows_log2] * sampling.active_surface + [rows[0]] * (recipe.surface_levels - sampling.active_surface),
-            "radiance": [recipe.radiance_rows_log2] * sampling.active_radiance
-            + [rows[1]] * (recipe.radiance_levels - sampling.active_radiance),
-            "first": [sampling.active_surface, sampling.active_radiance],
+            **{name: [m] * a + [r] * (k - a) for name, m, r, a, k in zip(names, most, rows, active, levels, strict=True)},
+            "first": list(active),
             "evidence": f"rows for each of the finer levels, cells of the finest at the surface: {evidence}",
         }
         self._resize_tables(self.state.tables, generator)

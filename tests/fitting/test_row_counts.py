@@ -23,7 +23,8 @@ from mmsynth.scene.scene import Region, Scene, Sensor
 SMALL: dict[str, Any] = {
     "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "radiance_levels": 4, "occupancy_resolution": 24,
     "occupancy_every": 4, "eikonal_points": 64, "radiance_hidden": 32, "surface_rows_log2": 16, "radiance_rows_log2": 17,
-    "radiance_cells": 60.0, "cells_per_row": 2.0, "tables_at": 0.125, "levels_until": 0.5, "poses": "off", "rig": "off", "average": 0.25,
+    "radiance_cells": 60.0, "cells_per_row": 2.0, "rays_per_row": 1e-3, "tables_at": 0.125, "levels_until": 0.5, "poses": "off",
+    "rig": "off", "average": 0.25,
     "view_dependence": 1,
     "exposure": "off",
 }  # fmt: skip
@@ -61,10 +62,18 @@ def test_the_count_is_that_of_cells_with_corners_on_both_sides(radius: float) ->
 
 
 def test_rows_stay_within_what_is_sensible_and_the_recipe_allows() -> None:
-    assert rows_log2(2.0**15 * 3, 3.0, 19) == 15
-    assert rows_log2(2.0**15 * 3 * 1.4, 3.0, 19) == 15 and rows_log2(2.0**15 * 3 * 1.5, 3.0, 19) == 16  # the nearest
-    assert rows_log2(0.0, 3.0, 19) == 12 and rows_log2(1e12, 3.0, 19) == 19
-    assert rows_log2(1e12, 3.0, 9) == rows_log2(0.0, 3.0, 9) == 9  # a recipe may ask for less
+    assert rows_log2(2.0**15, 19) == 15
+    assert rows_log2(2.0**15 * 1.4, 19) == 15 and rows_log2(2.0**15 * 1.5, 19) == 16  # the nearest
+    assert rows_log2(0.0, 19) == 12 and rows_log2(1e12, 19) == 19
+    assert rows_log2(1e12, 9) == rows_log2(0.0, 9) == 9  # a recipe may ask for less
+
+
+def test_a_short_fit_has_fewer_rows(scene: Scene) -> None:
+    """50 rays for a row of the radiance, 100 for one of the surface, 1638 rays a step."""
+    recipe = Recipe.model_validate({**SMALL, "rays_per_row": 50.0, "samples_per_step": 16384})
+    designs = {steps: Trainer(scene, recipe, steps, None, 0, "cpu").field.design for steps in (100, 2000, 8000)}
+    assert [d.radiance_rows_log2 for d in designs.values()] == [12, 16, 17]
+    assert [d.surface_rows_log2 for d in designs.values()] == [12, 15, 16]
 
 
 @settings(max_examples=30, deadline=None)
@@ -100,7 +109,7 @@ def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
     design, evidence = trainer.field.design, trainer.needs.evidence["tables"]
     assert isinstance(design.radiance_rows_log2, tuple) and design.radiance_rows_log2[:2] == (17, 17)
     fine = design.radiance_rows_log2[-1]
-    assert 12 <= fine < 17 and f"radiance 2^{fine} for" in evidence
+    assert 12 <= fine < 17 and f"radiance 2^{fine} for" in evidence and "no more" not in evidence.split("radiance")[1]
     table = trainer.field.appearance.table
     assert torch.equal(table[:coarse], before[:coarse]) and len(table) == int(trainer.field.appearance.offsets[-1]) < len(before)
     assert torch.equal(trainer.optimiser.moments["appearance.table"][0][:coarse], moments[:coarse]) and moments[:coarse].any()
