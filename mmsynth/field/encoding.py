@@ -43,7 +43,7 @@ class HashGrid(nn.Module):
         return 2.0 * self.extent / float(self.resolutions[min(active, len(self.resolutions)) - 1])
 
     def resize(self, first: int, rows_log2: Sequence[int], generator: torch.Generator) -> int:
-        """Give the levels from ``first`` on other numbers of rows: they start anew, the others stay as they are.
+        """Give the levels from ``first`` on other numbers of rows: they start anew, unless all have them already; the others stay.
 
         Returns:
             the number of rows before level ``first``: those that are as they were.
@@ -53,6 +53,8 @@ class HashGrid(nn.Module):
         kept, offsets = int(self.offsets[first]), _offsets(self.resolutions.tolist(), rows_log2)
         if not torch.equal(offsets[: first + 1], self.offsets[: first + 1].cpu()):
             raise ValueError(f"{rows_log2} changes the rows of a level before level {first}")
+        if torch.equal(offsets, self.offsets.cpu()):
+            return int(offsets[-1])
         self.offsets = offsets.to(self.offsets.device)
         fresh = torch.empty(int(self.offsets[-1]) - kept, FEATURES).uniform_(-_START, _START, generator=generator)
         self.table.data, self.table.grad = torch.cat([self.table.data[:kept], fresh.to(self.table.device)]), None

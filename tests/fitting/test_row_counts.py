@@ -83,11 +83,14 @@ def test_other_rows_for_finer_levels_leave_the_coarser_as_they_are(levels: int, 
     grid = HashGrid(levels, before, 4, 4 * finer)
     grid.table.data.normal_()
     x = torch.rand(200, 3) * 2 - 1
-    values, table = grid(x, first).detach(), grid.table
+    values, everything, table = grid(x, first).detach(), grid(x, levels).detach(), grid.table
     rows = [before] * first + [after] * (levels - first)
     kept = grid.resize(first, rows, torch.Generator().manual_seed(0))
     assert grid.table is table and torch.equal(grid(x, first).detach(), values)
-    assert grid.table[kept:].abs().max() <= 1e-4 if first < levels else kept == len(grid.table)
+    if kept == len(grid.table):  # nothing has another size
+        assert torch.equal(grid(x, levels).detach(), everything)
+    else:
+        assert grid.table[kept:].abs().max() <= 1e-4
     expected = HashGrid(levels, rows, 4, 4 * finer)
     assert torch.equal(grid.offsets, expected.offsets) and grid.table.shape == expected.table.shape
 
