@@ -27,7 +27,7 @@ class Recipe(BaseModel):
     radiance_rows_log2: int = Field(17, ge=8, le=22)
     surface_cells: float = Field(2.0, gt=0, description="finest surface grid: cells per two pixel footprints")
     radiance_cells: float = Field(4.0, gt=0, description="finest radiance grid: cells per two pixel footprints")
-    cells_per_row: float = Field(3.0, gt=0, description="cells of the finest level at the surface that share a row of its hash table")
+    cells_per_row: float = Field(1.5, gt=0, description="cells of the finest level at the surface that share a row of its hash table")
     rays_per_row: float = Field(
         50.0, gt=0, description="rays of the fit for each row of a level of the radiance's tables; half the rows for the surface's"
     )
