@@ -69,7 +69,7 @@ class Recipe(BaseModel):
     poses_worth: float = Field(0.01, gt=0, description="share of the error of rays not learned from that motions must save")
     decide_at: float = Field(0.6, ge=0, le=1, description="progress at which residuals decide on directions and exposure")
     view_dependence: Literal["auto", 0, 1, 2, 3] = Field("auto", description="degree of the harmonics of radiance over directions")
-    view_dependence_worth: float = Field(0.1, ge=0, description="share of the error that a higher degree must save")
+    view_dependence_worth: float = Field(0.05, ge=0, description="share of the error that a higher degree must save")
     exposure: Literal["auto", "on", "off"] = Field("auto", description="a gain per frame")
     exposure_worth: float = Field(0.05, gt=0, description="spread of exposure between frames that asks for gains")
     learning_rate_exposure: float = Field(1e-3, gt=0)

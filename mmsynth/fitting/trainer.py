@@ -36,7 +36,7 @@ from mmsynth.fitting.tables import cells_at_surface, rows_log2
 from mmsynth.scene.scene import Scene
 
 CHECKPOINT_SECONDS = 60.0
-PROBE_RAYS = 1024  # per modality
+PROBE_RAYS = 2048  # per modality
 _GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
