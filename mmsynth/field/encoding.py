@@ -46,7 +46,7 @@ class HashGrid(nn.Module):
         """Give the levels from ``first`` on other numbers of rows: they start anew, unless all have them already; the others stay.
 
         Returns:
-            the number of rows before level ``first``: those that are as they were.
+            how many of the first rows of the table are as they were.
         Raises:
             ValueError: a level before ``first`` would change, too.
         """

@@ -70,7 +70,7 @@ def _triangulated(seen: list[Sighting]) -> np.ndarray | None:
         direction, valid = unproject(pixel, frame.camera)
         if not valid:
             return None
-        ray = frame.camera_to_world[:3, :3] @ (direction / np.linalg.norm(direction))
+        ray = frame.camera_to_world[:3, :3] @ direction
         across = np.eye(3) - np.outer(ray, ray)
         normal += across
         right += across @ frame.camera_to_world[:3, 3]

@@ -35,7 +35,7 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
         path: the folder with ``transforms.json``, or the JSON file itself.
         modalities: names or aliases to read; None: all.
     Raises:
-        InputError: wrong key, lens model other than Brown's, pose that is not finite and rigid, or no image at all.
+        InputError: wrong key, unknown lens model, pose that is not finite and rigid, or no image at all.
     """
     path = Path(path)
     path = path / "transforms.json" if path.is_dir() else path
