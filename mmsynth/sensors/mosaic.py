@@ -69,6 +69,11 @@ def demosaic(raw: Tensor, pattern: np.ndarray, offset: tuple[int, int] = (0, 0))
     return torch.where(present, frames, filled).reshape(*raw.shape[:-2], channels, height, width)
 
 
+def is_bayer(pattern: np.ndarray) -> bool:
+    """Whether a pattern is one of Bayer's four, of red, green and blue as channels 0, 1, 2."""
+    return tuple(map(tuple, pattern.tolist())) in BAYER
+
+
 def demosaic_edge_aware(raw: np.ndarray, pattern: np.ndarray, offset: tuple[int, int] = (0, 0)) -> np.ndarray:
     """Bayer frame (H, W) in [0, 1] → (3, H, W) float32 by OpenCV's edge-aware method, in its 16 bits.
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from small_scenes import HEIGHT, WIDTH, around, write_scene
 
+from mmsynth.scene.load import load_scene
 from mmsynth.sensors import lenses
-from mmsynth.sensors.camera import Camera, project, ray_map
+from mmsynth.sensors.camera import Camera, project, ray_map, unproject
 
 Row = Callable[[str, str, str], None]
 
@@ -106,6 +109,31 @@ def test_tangential_terms_keep_their_place(row: Row) -> None:
     row("distortion order k1 k2 p1 p2 k3 k4, 5 MP", f"MultimodalStudio reads k1 k2 k3 k4 p1 p2: up to {wrong:.1f} px", f"{ours:.0e} px")
 
 
+def test_image_rows_go_down(row: Row) -> None:
+    """An inverse with y turned up first, with the coefficients as they are, has the tangential terms with the wrong sign."""
+    camera = Camera(2592, 1944, 2300.0, 2300.0, 1295.5, 971.5, (-0.1, 0.08, 1e-3, -8e-4, 0.0, 0.0))
+    pixels = np.random.default_rng(0).uniform((0, 0), (2591, 1943), (5000, 2))
+    distorted = torch.from_numpy((pixels - [camera.cx, camera.cy]) / camera.fx)
+    up = torch.tensor([1.0, -1.0], dtype=torch.float64)
+    x, y = (up * lenses.undistort(up * distorted, torch.from_numpy(camera.coefficients))[0]).T.numpy()
+    back = lambda rays: cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, camera.coefficients)[0][:, 0]
+    wrong = np.linalg.norm(back(np.stack([x, y, np.ones_like(x)], 1)) - pixels, axis=1).max()
+    ours = np.linalg.norm(back(unproject(pixels, camera)[0]) - pixels, axis=1).max()
+    assert wrong > 3 and ours < 1e-9
+    row("rows of the image go down, tangential terms, 5 MP", f"MultimodalStudio turns y first: up to {wrong:.1f} px", f"{ours:.0e} px")
+
+
+def test_the_middle_of_a_picture(row: Row, tmp_path: Path) -> None:
+    """cx = w / 2 counts from the picture's corner, pixels by their centres: half a pixel apart."""
+    camera = load_scene(write_scene(tmp_path / "scene", {"rgb": around(6)})).frames[0].camera
+    middle = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+    usual = np.linalg.norm(middle - [WIDTH / 2, HEIGHT / 2])
+    x, y, z = unproject(middle, camera)[0]
+    ours = np.hypot(x, y) / z * camera.fx
+    assert usual > 0.7 and ours < 1e-12
+    row("the axis of a transforms.json with cx = w / 2", f"whole pixels minus cx: {usual:.2f} px off", f"{ours:.0f} px")
+
+
 def test_a_fisheye_sees_beside_and_behind_itself(row: Row) -> None:
     """At 90 degrees off the axis x / z is infinite, behind it has the wrong sign."""
     camera = Camera(201, 201, 50.0, 50.0, 100.0, 100.0, (0.01, 0.0, 0.0, 0.0), "kannala_brandt")
@@ -114,17 +142,31 @@ def test_a_fisheye_sees_beside_and_behind_itself(row: Row) -> None:
     back = project(directions[valid], camera)
     assert np.abs(back - _pixels(camera)[valid.reshape(-1)]).max() < 1e-6
     theirs = cv2.fisheye.undistortPoints(np.array([[[0.0, 100.0]]]), camera.matrix, camera.coefficients)[0, 0]
-    assert theirs[0] > 0 or not np.isfinite(theirs).all() or abs(theirs[0]) > 10  # no finite x / z is that ray
+    ray = np.append(theirs, 1.0) / np.linalg.norm(np.append(theirs, 1.0))
+    off = np.degrees(np.arccos(ray @ directions[100, 0]))
+    assert off > 10
     row(
-        "fisheye, 108° off the axis", f"OpenCV's point before the lens: x / z = {theirs[0]:.3g}",
+        "fisheye, 108° off the axis", f"OpenCV's point before the lens: x / z = {theirs[0]:.3g}, {off:.0f}° from the ray",
         f"a ray with z = {directions[100, 0, 2]:.2f}, back to {np.abs(back - _pixels(camera)[valid.reshape(-1)]).max():.0e} px",
     )  # fmt: skip
+
+
+def _flat_rays(directions: np.ndarray) -> str:
+    """MultimodalStudio's rays: (H, W, 3) squeezed, normalised along the axis that is the second of a list of rays."""
+    squeezed = torch.from_numpy(directions).squeeze()
+    if squeezed.ndim == 1:
+        with pytest.raises(IndexError):
+            squeezed.norm(dim=1)
+        return "`.squeeze()` leaves (3,): the norm of each ray is an IndexError"
+    assert squeezed.ndim == 2 and squeezed.shape != directions.shape
+    return f"`.squeeze()`: {tuple(squeezed.shape)}, as of a grey picture {squeezed.shape[1]} wide and {squeezed.shape[0]} high"
 
 
 @pytest.mark.parametrize("size", [(32, 1), (1, 24), (1, 1)])
 def test_pictures_of_one_row_or_column_or_pixel(row: Row, size: tuple[int, int]) -> None:
     camera = Camera(*size, 30.0, 30.0, (size[0] - 1) / 2, (size[1] - 1) / 2, (-0.1, 0.02, 1e-3, 1e-3))
     directions, valid = ray_map(camera)
+    usual = _flat_rays(directions.copy())
     assert directions.shape == (size[1], size[0], 3) and valid.all()
     np.testing.assert_allclose(project(directions, camera).reshape(-1, 2), _pixels(camera), atol=1e-9)
-    row(f"a picture of {size[0]} x {size[1]}", "`.squeeze()` drops an axis", "its rays, as of any other")
+    row(f"a picture of {size[0]} x {size[1]}", usual, "its rays, as of any other")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from torch.nn.functional import normalize, softplus
+from usual import nerfacc_keeps, neus_weights
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
@@ -21,13 +22,6 @@ from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
 
 Row = Callable[[str, str, str], None]
-
-
-def neus_weights(sdf: torch.Tensor, s: float) -> torch.Tensor:
-    """The published form (Wang et al. 2021, code): α = (Φ(f₀) - Φ(f₁) + 1e-5) / (Φ(f₀) + 1e-5), Π(1 - α + 1e-7)."""
-    a, b = torch.sigmoid(s * sdf[:-1]), torch.sigmoid(s * sdf[1:])
-    alpha = ((a - b + 1e-5) / (a + 1e-5)).clamp(0, 1)
-    return alpha * torch.cumprod(torch.cat([torch.ones(1), 1 - alpha + 1e-7]), 0)[:-1]
 
 
 def ours(sdf: torch.Tensor, s: float) -> torch.Tensor:
@@ -143,6 +137,7 @@ def test_any_sharpness_is_finite_and_sums_to_at_most_one(row: Row, s: float) -> 
     expected = 1 - (1 / (1 + np.exp(s))) / (1 / (1 + np.exp(-s))) if s < 100 else 1.0
     assert float(weights.detach().sum()) == pytest.approx(expected, abs=1e-5)
     usual = neus_weights(sdf.detach(), s).sum()
+    assert abs(float(usual) - expected) > 3e-5
     row(
         f"through a surface, s = {s:g}",
         f"NeuS: opacity {usual:.5f}",
@@ -179,7 +174,15 @@ def test_opaque_section_does_not_divide_by_zero(row: Row) -> None:
     weights.sum().backward()
     assert weights.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
     assert torch.isfinite(sdf.grad).all()
-    row("samples behind an opaque section", "cumprod of 0: an epsilon of 1e-7, and half the speed", "exp of a sum: weights 1, 0, 0, 0")
+    left = neus_weights(sdf.detach(), 1e4)[1:].sum()
+    alpha = torch.tensor([1.0, 1.0, 0.0, 1.0], requires_grad=True)
+    (alpha * torch.exp(torch.cat([torch.zeros(1), torch.log(1 - alpha).cumsum(0)[:-1]]))).sum().backward()
+    assert left > 0 and alpha.grad.isnan().any()
+    row(
+        "samples behind an opaque section",
+        f"cumprod with 1e-7: {float(left):.0e} of what is behind; exp(Σ log(1 - α)): gradient NaN for {int(alpha.grad.isnan().sum())} of 4",
+        "exp of a sum: weights 1, 0, 0, 0",
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -206,7 +209,7 @@ def test_a_ray_that_was_ended_is_opaque(way: str) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("extent", [1.0, 2.0])
-def test_depth_of_a_sphere_is_exact(way: str, extent: float) -> None:
+def test_depth_of_a_sphere_is_exact(row: Row, way: str, extent: float) -> None:
     """The surface is where the section crosses it: no bias by half a step."""
     directions = normalize(torch.tensor([[0.0, 0.0, 1.0], [0.05, 0.1, 1.0], [-0.1, 0.08, 1.0]]), dim=1)
     origins = torch.tensor([[0.0, 0.0, -3.0]]).expand(3, 3)
@@ -214,6 +217,22 @@ def test_depth_of_a_sphere_is_exact(way: str, extent: float) -> None:
     exact = -b - torch.sqrt(b * b - 9.0 + 0.25)
     depth = _trace(way, _parts(extent=extent), origins, directions).depth
     torch.testing.assert_close(depth, exact.to(depth), atol=2e-4, rtol=0)
+    # MultimodalStudio: opacity around each sample, depth at the middle of the interval that begins there
+    t = exact[:, None] + SAMPLING.step * (torch.arange(-32, 32) + 0.3)
+    x = origins[:, None] + t[..., None] * directions[:, None]
+    half = 0.5 * SAMPLING.step * (normalize(x, dim=-1) * directions[:, None]).sum(-1).clamp(max=0)
+    f, s = x.norm(dim=-1) - 0.5, SAMPLING.sharpness
+    p, c = torch.sigmoid(s * (f - half)), torch.sigmoid(s * (f + half))
+    alpha = ((p - c + 1e-5) / (p + 1e-5)).clamp(0, 1)
+    weights = alpha * torch.cumprod(torch.cat([torch.ones(3, 1), 1 - alpha + 1e-7], 1), 1)[:, :-1]
+    usual = float(((weights * (t + 0.5 * SAMPLING.step)).sum(1) / weights.sum(1) - exact).mean())
+    assert usual > 5 * float((depth - exact).abs().max())
+    if extent == 1.0:
+        row(
+            f"depth of a ball, s = {s:.0f}, a step of {SAMPLING.step:g}, {way}",
+            f"MultimodalStudio, at the middle of intervals: {usual:+.4f}, {usual / SAMPLING.step:.2f} steps",
+            f"off by up to {float((depth - exact).abs().max()):.0e}",
+        )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -241,9 +260,11 @@ def test_camera_inside_the_region_and_zero_samples(row: Row, way: str) -> None:
     assert int(nothing.samples) == 0 and torch.isnan(nothing.depth).all() and not nothing.opacity.any() and not nothing.features.any()
     (nothing.opacity.sum() + nothing.features.sum()).backward()
     assert all(p.grad is None or not p.grad.any() for m in parts for p in m.parameters())
+    with pytest.raises(RuntimeError, match="min"):
+        nothing.depth.clip(torch.empty(0).min(), torch.empty(0).max())
     row(
         f"a camera inside the region; a batch without a sample, {way}",
-        "empty tensors: a crash",
+        "MultimodalStudio clips depth to the nearest sample's: RuntimeError, min of none",
         "its depth, to 1e-3; nothing, and no gradient",
     )
 
@@ -281,7 +302,11 @@ def test_rays_in_a_face_of_a_grid_cell_are_finite(row: Row, way: str) -> None:
     assert not hits.opacity[1:].any() and hits.depth[1:].isnan().all()
     slab = (torch.tensor([-0.25, 0.25]) - origins[:, 1:2]) / directions[:, 1:2]
     assert slab.isnan().any()
-    row(f"rays in the face of a cell, {way}", "the slab test: 0 / 0 = NaN", "the depth of the ball, to 1e-3")
+    row(
+        f"rays in the face of a cell, {way}",
+        f"the slab test: 0 / 0 = NaN for {int(slab.isnan().any(1).sum())} of 3",
+        "the depth of the ball, to 1e-3",
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -310,10 +335,43 @@ def test_ball_interval_of_tangent_and_receding_rays(row: Row) -> None:
     assert float(far[3] - near[3]) == pytest.approx(2 * np.sqrt(0.75), abs=5e-3)
     o, d = origins[3], directions[3]
     usual = 2 * torch.sqrt(((o @ d) ** 2 - o @ o + 1).clamp(min=0))
+    assert abs(float(usual) - np.sqrt(3)) > 0.1
     row(
         "the chord of a ball 10,000 radii away, float32",
         f"(o·d)² - |o|² + 1: {float(usual):.2f}",
         f"{float(far[3] - near[3]):.3f}; exact 1.732",
+    )
+
+
+def _roi(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """MultimodalStudio's sphere: near and far = -o·d ∓ √max(Δ, 0.01), 0.01 at least, and whether it counts as met: Δ > 0.01."""
+    along = (origins * directions).sum(1)
+    delta = along**2 - (origins * origins).sum(1) + 1
+    half = delta.clamp(min=0.01).sqrt()
+    return (-along - half).clamp(min=0.01), (-along + half).clamp(min=0.01), delta > 0.01
+
+
+def test_rays_that_graze_the_region_and_rays_that_leave_it(row: Row) -> None:
+    """A chord of 0.19 radii is inside the region; what lies behind a camera is not."""
+    origins, directions = _towards(100, 0.9955)
+    near, far = ball_interval(origins, directions)
+    met = _roi(origins, directions)[2]
+    chord = 2 * np.sqrt(1 - 0.9955**2)
+    torch.testing.assert_close(far - near, torch.full((100,), chord), atol=1e-3, rtol=0)
+    assert not met.any()
+    row(
+        f"rays with {chord:.2f} radii of the region before them",
+        f"MultimodalStudio: background for {1 - float(met.float().mean()):.0%}",
+        f"{float((far - near).mean()):.2f} radii are seen",
+    )
+    origins, directions = _towards(100, 0.3)
+    near, far = ball_interval(origins, -directions)
+    theirs = _roi(origins, -directions)
+    assert torch.equal(near, far) and theirs[2].all() and (theirs[0] == theirs[1]).all()
+    row(
+        "rays that leave the region behind them",
+        f"MultimodalStudio: foreground for {float(theirs[2].float().mean()):.0%}, near = far = {float(theirs[1].max()):.2f}",
+        "no interval",
     )
 
 
@@ -383,6 +441,7 @@ def test_a_thin_sheet_is_not_stepped_over(row: Row, steps: float) -> None:
     assert fewer.samples < hits.samples and float(fewer.opacity.min()) >= low - 1e-6
     at = -0.9 * tilted[:, 2:] + tilted[:, 2:] * (torch.arange(64) + jitter[:, None]) / 64 * 1.8
     usual = float((at.abs() - half < 0).any(1).double().mean())
+    assert usual < 0.7
     row(
         f"a sheet of {steps:g} steps' thickness",
         f"64 even samples: {usual:.0%} of the rays meet it",
@@ -468,9 +527,12 @@ def test_an_empty_occupancy_grid_reopens(row: Row) -> None:
     hits = _trace("fused", (surface, appearance, occupancy), *_towards(20, 0.1))
     assert (hits.opacity > 0.99).all()
     assert occupancy.update(lambda x: surface(x, 2), 100.0, generator, 1.0)
+    # f = 5 everywhere: VolSDF's density is 0, and so is every cell's opacity
+    none = nerfacc_keeps(50.0 * torch.exp(torch.full((8**3,), -5.0 * 100)))
+    assert not none.any()
     row(
         "an occupancy grid in which nothing is left",
-        "0 samples, aborting; or a white picture for ever",
+        f"nerfacc, above the mean of no positive cell, NaN: {int(none.sum())} of {len(none)} cells kept",
         "opened again, counted, and what appears is seen",
     )
 
@@ -514,7 +576,15 @@ def test_one_hash_level(row: Row, way: str) -> None:
     exact = torch.full((50,), 3 - np.sqrt(0.25 - 0.09)).to(hits.depth)
     torch.testing.assert_close(hits.depth, exact, atol=3e-4, rtol=0)
     assert hits.features.shape == (50, 4)
-    row(f"one hash level, {way}", "growth (b / a)^(1 / (L - 1)): 0 / 0", f"depth to {float((hits.depth - exact).abs().max()):.0e}")
+    # instant-ngp: per-level scale exp(ln(b / a) / (L - 1)), in the kernel exp2(level log2(scale)) a - 1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        usual = np.exp2(0 * np.log2(np.exp(np.log(100 / 4) / np.float64(0)))) * 4 - 1
+    assert np.isnan(usual)
+    row(
+        f"one hash level, {way}",
+        "instant-ngp's scale of it, exp(ln(b / a) / (L - 1)): inf, and its resolution NaN",
+        f"depth to {float((hits.depth - exact).abs().max()):.0e}",
+    )
 
 
 def test_no_active_level() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -12,7 +14,7 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import surface_rate_factor
 
 
-def _moved(sharpness: float) -> float:
+def _moved(sharpness: float, slower: bool = True) -> float:
     """How far noise, which asks for nothing, makes the surface tremble late in a fit, in widths of the soft surface."""
     torch.manual_seed(0)
     recipe = Recipe()
@@ -20,18 +22,26 @@ def _moved(sharpness: float) -> float:
     torch.nn.init.normal_(surface.last, std=0.3)
     parameters = dict(surface.named_parameters())
     optimiser = Adam(parameters, {n: recipe.learning_rate_grid if n == "grid.table" else recipe.learning_rate_network for n in parameters})
-    slower = dict.fromkeys(parameters, surface_rate_factor(sharpness, recipe))
+    factors = dict.fromkeys(parameters, surface_rate_factor(sharpness, recipe) if slower else 1.0)
     points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=-1) * 0.5
     trembling = []
     for _ in range(20):
         before = surface(points, 4).detach()
         (surface(points, 4) * torch.randn(len(points))).sum().backward()
-        optimiser.step(recipe.learning_rate_end, slower)
+        optimiser.step(recipe.learning_rate_end, factors)
         trembling.append(float((surface(points, 4).detach() - before).square().mean().sqrt()))
     return sum(trembling) / len(trembling) * sharpness / 3.5
 
 
 @pytest.mark.parametrize("sharpness", [200.0, 800.0, 3200.0])
-def test_noise_moves_a_surface_by_less_than_a_quarter_of_its_softness_however_sharp(sharpness: float) -> None:
+def test_noise_moves_a_surface_by_less_than_a_quarter_of_its_softness_however_sharp(
+    row: Callable[[str, str, str], None], sharpness: float
+) -> None:
     """Measured on photographs: 0.17 is as good as less (the mean over the last steps rests), 0.43 costs 1.7 dB, more everything."""
-    assert _moved(sharpness) < 0.25
+    usual, ours = _moved(sharpness, slower=False), _moved(sharpness)
+    assert ours < 0.25 and usual > 0.4 and usual > 2 * ours
+    row(
+        f"noise in the gradients of a surface of sharpness {sharpness:.0f}",
+        f"Adam at one rate: trembles by {usual:.2g} of its softness",
+        f"{ours:.2g}",
+    )

@@ -6,10 +6,16 @@ import json
 import re
 from pathlib import Path
 
+import cv2
+import numpy as np
+import pytest
 from analytic import AnalyticField, scene_of, sphere
 
 from mmsynth.operations.evaluate import evaluate
-from mmsynth.report.report import curve_svg, read_log, write_report
+from mmsynth.report.report import curve_svg, measured_channels, read_log, write_report
+from mmsynth.scene.images import write_png16
+from mmsynth.scene.scene import Frame, Sensor
+from mmsynth.sensors.camera import Camera
 
 
 def test_report(tmp_path: Path) -> None:
@@ -39,3 +45,22 @@ def test_log(tmp_path: Path) -> None:
     path.write_text(json.dumps({"step": 1, "elapsed": 1.0, "loss": 0.5, "psnr": {"rgb": 20}}) + '\n{"step": 2, "el')
     assert len(read_log(path)) == 1
     assert "<svg" in curve_svg([{"step": 1, "loss": None, "psnr": {}}])
+
+
+@pytest.mark.parametrize("pattern", [[[1, 2], [0, 1]], [[2, 1], [1, 0]], [[0, 1], [2, 3]], [[0]]])
+def test_previews_of_a_mosaic_show_every_channel_in_its_place(tmp_path: Path, pattern: list[list[int]]) -> None:
+    """Each channel has a level of its own; Bayer patterns by OpenCV's edge-aware method, others by normalised convolution."""
+    mosaic = np.array(pattern)
+    count = int(mosaic.max()) + 1
+    levels = (np.arange(count) + 1) / 8
+    raw = np.tile(levels[mosaic], (20, 30))[:20, :30]
+    raw[6:10, 10:20] = 0.9
+    write_png16(tmp_path / "0.png", raw)
+    sensor = Sensor("rgb", tuple("RGBW"[:count]), (None,) * count, mosaic)
+    shown = measured_channels(sensor, Frame("rgb", 0, tmp_path / "0.png", Camera(30, 20, 20.0, 20.0, 15.0, 10.0), np.eye(4)))
+    assert shown.shape == (20, 30, count)
+    np.testing.assert_allclose(shown[1:4, 2:8], np.broadcast_to(levels, (3, 6, count)), atol=1e-4)
+    if count == 3:
+        codes = {(1, 2): cv2.COLOR_BayerGR2RGB_EA, (2, 1): cv2.COLOR_BayerRG2RGB_EA}
+        theirs = cv2.demosaicing(np.round(raw * 65535).astype(np.uint16), codes[tuple(pattern[0])]) / 65535
+        np.testing.assert_allclose(shown, theirs, atol=1e-5)
