@@ -288,6 +288,84 @@ def generate_dataset(
     print(json.dumps({"dataset": str(written), "views": len(views)}) if as_json else f"wrote {len(views)} views into {destination}/")
 
 
+@command("simulate")
+def simulate(
+    sensor: Annotated[list[str], typer.Option(help="sensor file, or the name of a packaged one; once per sensor of the rig")],
+    poses: Annotated[Path | None, typer.Option(help="of the rig's reference: as for generate-dataset")] = None,
+    views: Annotated[str | None, typer.Option(help="instead: at frames of the scene, train, test, all or ids, e.g. 9,19")] = None,
+    run: RunOption = None,
+    rig: Annotated[str, typer.Option(help="native: each sensor at its place on the rig; aligned: all at the poses")] = "native",
+    delta: Annotated[
+        bool, typer.Option("--delta", help="of captured sensors: apply the file's effects on top of what the field has")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="of noise and fixed patterns")] = 0,
+    file_format: Annotated[str, typer.Option("--format", help="png, tiff or dng")] = "png",
+    out: Annotated[Path | None, typer.Option(help="default: RUN/simulated")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The sensor's digital twin: raw frames as it would have recorded them, a scene that can be fitted again."""
+    from mmsynth.operations import simulate as twins
+    from mmsynth.operations.trajectories import load_views
+
+    if (poses is None) == (views is None):
+        raise InputError("simulate: give one of --poses and --views.")
+    folder, field, scene = _load(run)
+    destination = out or folder / "simulated"
+    with _bar("simulate", as_json) as show:
+        if poses is not None:
+            path = poses if poses.exists() or poses.is_absolute() else scene.root / poses
+            at = load_views(path if path.exists() else poses, field, scene)
+            written = twins.simulate(field, sensor, at, destination, seed, file_format, rig, delta, progress=show)
+        else:
+            if rig != "native":
+                raise InputError("--rig: frames of the scene have their sensors' own poses, expected it with --poses.")
+            split = {"train": scene.split.train, "test": scene.split.test, "all": None}
+            chosen = split[views] if views in split else _views(views)
+            written = twins.simulate_at_frames(field, scene, sensor, destination, chosen, seed, file_format, delta, progress=show)
+    print(
+        json.dumps({"scene": str(written.parent)})
+        if as_json
+        else f"wrote {written.parent}/ ({written.name}, modalities, sidecars, sensors)"
+    )
+
+
+@command("calibrate-noise")
+def calibrate_noise(
+    frames: Annotated[
+        list[Path] | None, typer.Argument(metavar="[FRAME]...", help="raw files of the one --sensor: no field needed")
+    ] = None,
+    run: RunOption = None,
+    modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="sensor files that say bits, black level and alignment; default: what the frames use")
+    ] = None,
+    raw: Annotated[Path | None, typer.Option(help="other frames at the same poses, RAW/MODALITY/0009.png")] = None,
+    views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: those of the training")] = None,
+    out: Annotated[Path | None, typer.Option(help="default: RUN/sensors, or sensors")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Gain, read noise and PRNU from photon transfer, into sensor files; from a scene's frames and its field, or from frames alone."""
+    from mmsynth.operations import calibrate_noise as noise
+    from mmsynth.report.text import noise_text
+    from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
+
+    files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
+    if frames:
+        if len(files) != 1:
+            raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
+        found, destination = {files[0].name: noise.calibrate_from_frames(files[0], frames)}, out or Path("sensors")
+    else:
+        folder, field, scene = _load(run)
+        known = noise.by_modality(files)
+        with _bar("noise", as_json) as show:
+            found = noise.calibrate_noise(field, scene, _names(modalities), known, raw, _views(views), progress=show)
+        destination = out or folder / "sensors"
+    noise.write(found, destination)
+    print(json.dumps({"out": str(destination), "sensors": {n: c.to_json() for n, c in found.items()}}) if as_json else noise_text(found))
+    if not as_json:
+        print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
+
+
 @command("mesh")
 def mesh(
     run: RunOption = None,

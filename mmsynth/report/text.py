@@ -1,9 +1,12 @@
-"""Scores as a table of plain text."""
+"""Scores and figures as tables of plain text."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mmsynth.operations.calibrate_noise import Calibrated
 
 _COLUMNS = {
     "psnr": "psnr [dB]",
@@ -29,4 +32,19 @@ def score_text(scores: Mapping[str, Any]) -> str:
     lines += [f"{key}: {value:.5g}" for key, value in scores.get("geometry", {}).items() if isinstance(value, float)]
     seconds = ", ".join(f"{k} {v:.1f}" for k, v in scores.get("seconds", {}).items() if isinstance(v, (int, float)))
     lines.append(f"seconds: {seconds}; {scores.get('rays_per_s', 0):,.0f} rays/s")
+    return "\n".join(lines)
+
+
+def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
+    """The result of ``calibrate-noise``: one row per sensor, with standard deviations; "<": not told, and what would have been seen."""
+    lines = [f"{'sensor':14s}{'frames':>7s}{'bits':>5s}{'gain [DN/e-]':>22s}{'full scale [e-]':>20s}{'read [e-]':>14s}{'PRNU [%]':>14s}"]
+    pair = lambda value, sd, digits: f"{value:.{digits}f} ± {sd:.{digits}f}" if value > 0 else f"< {sd:.{digits}f}"
+    for name, c in calibrated.items():
+        p, noise = c.found, c.file.noise
+        full = noise.electrons_at_one
+        lines.append(
+            f"{name:14s}{c.frames:7d}{noise.bits:5d}{f'{p.gain_dn_e:.4g} ± {p.gain_sd:.2g}':>22s}"
+            f"{pair(full, full * p.gain_sd / p.gain_dn_e, 0):>20s}{pair(p.read_e, p.read_sd, 1):>14s}"
+            f"{pair(100 * p.prnu, 100 * p.prnu_sd, 2):>14s}"
+        )
     return "\n".join(lines)

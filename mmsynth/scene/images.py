@@ -26,7 +26,7 @@ from mmsynth.errors import InputError
 from mmsynth.files import write_atomic
 from mmsynth.scene.scene import Frame, Sensor
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy", ".npz", ".exr")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".npy", ".npz", ".exr")
 
 # --- reading ---------------------------------------------------------------------------------------------------------
 
@@ -67,6 +67,8 @@ def read_native(path: Path) -> np.ndarray:
             image = _read_photo(path)
         elif suffix in (".tif", ".tiff"):
             image = _read_tiff(path)
+        elif suffix == ".dng":
+            image = _read_dng(path)
         elif suffix == ".exr":
             image = _read_exr(path)
         else:
@@ -178,6 +180,16 @@ def _read_tiff(path: Path) -> np.ndarray:
         return np.moveaxis(image, 0, -1) if image.ndim == 3 and series.axes[-1] == "X" else image
 
 
+def _read_dng(path: Path) -> np.ndarray:
+    """The mosaic as stored, (H, W); previews beside it are passed over."""
+    with tifffile.TiffFile(path) as file:
+        pages = [page for top in file.pages if isinstance(top, tifffile.TiffPage) for page in (top, *(top.pages or ()))]
+        for page in pages:
+            if isinstance(page, tifffile.TiffPage) and page.photometric == tifffile.PHOTOMETRIC.CFA:
+                return np.asarray(page.asarray())
+    raise InputError(f"{path}: no mosaic in this DNG file, expected a colour filter array.")
+
+
 def _read_exr(path: Path) -> np.ndarray:
     with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings there, and --json promises nothing else
         file = OpenEXR.File(str(path), separate_channels=True)
@@ -271,14 +283,66 @@ def write_png16(path: Path, image: np.ndarray) -> None:
     Raises:
         InputError: not 1 or 3 channels, or the disk refused.
     """
-    pixels = to_uint16(image)
-    if pixels.ndim == 3 and pixels.shape[2] == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    elif pixels.ndim != 2 and not (pixels.ndim == 3 and pixels.shape[2] == 1):
-        raise InputError(f"{path}: an image of shape {image.shape} does not fit a PNG file, which holds one or three channels.")
+    write_png(path, to_uint16(image))
+
+
+def write_png(path: Path, numbers: np.ndarray) -> None:
+    """Write uint8 or uint16 numbers (H, W), (H, W, 1) or RGB (H, W, 3) as they are.
+
+    Raises:
+        InputError: not 1 or 3 channels, or the disk refused.
+    """
+    if numbers.ndim == 3 and numbers.shape[2] == 3:
+        numbers = cv2.cvtColor(numbers, cv2.COLOR_RGB2BGR)
+    elif numbers.ndim != 2 and not (numbers.ndim == 3 and numbers.shape[2] == 1):
+        raise InputError(f"{path}: an image of shape {numbers.shape} does not fit a PNG file, which holds one or three channels.")
     # encoded in memory: cv2.imwrite does not report a full disk
-    data = cv2.imencode(".png", pixels)[1].tobytes()
+    data = cv2.imencode(".png", numbers)[1].tobytes()
     write_atomic(Path(path), lambda temporary: temporary.write_bytes(data))
+
+
+def write_tiff(path: Path, numbers: np.ndarray) -> None:
+    """Write numbers (H, W) or (H, W, C) as they are (zlib, any channel count)."""
+    photometric = "rgb" if numbers.ndim == 3 and numbers.shape[2] == 3 else "minisblack"
+    planar = "contig" if numbers.ndim == 3 else None
+    write_atomic(
+        Path(path),
+        lambda temporary: tifffile.imwrite(
+            temporary, numbers, photometric=photometric, planarconfig=planar, compression="zlib", metadata=None
+        ),
+    )
+
+
+# XYZ to linear sRGB (IEC 61966-2-1), for a camera whose colours nobody measured
+_XYZ_TO_RGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
+
+
+def write_dng(path: Path, numbers: np.ndarray, pattern: np.ndarray, black: int, white: int, model: str) -> None:
+    """Write a Bayer frame as DNG 1.4, uncompressed.
+
+    Args:
+        numbers: (H, W) uint16. pattern: (2, 2), 0 red, 1 green, 2 blue. black, white: of ``numbers``. model: of the camera.
+            Its colour matrix is that of sRGB: the file says what was measured, not which colours they are.
+    """
+    rational = lambda values: tuple(x for v in values for x in (round(v * 10000), 10000))
+    extra = [
+        (33421, "H", 2, (2, 2), True),  # CFARepeatPatternDim
+        (33422, "B", 4, bytes(int(c) for c in pattern.reshape(-1)), True),  # CFAPattern
+        (50706, "B", 4, bytes((1, 4, 0, 0)), True),  # DNGVersion
+        (50707, "B", 4, bytes((1, 1, 0, 0)), True),  # DNGBackwardVersion
+        (50708, "s", 0, model, True),  # UniqueCameraModel
+        (50714, "H", 1, black, True),  # BlackLevel
+        (50717, "H", 1, white, True),  # WhiteLevel
+        (50721, "2i", 9, rational(_XYZ_TO_RGB), True),  # ColorMatrix1
+        (50728, "2I", 3, rational((1.0, 1.0, 1.0)), True),  # AsShotNeutral
+        (50778, "H", 1, 21, True),  # CalibrationIlluminant1: D65
+    ]
+    write_atomic(
+        Path(path),
+        lambda temporary: tifffile.imwrite(
+            temporary, numbers, photometric="cfa", compression=None, metadata=None, software="mmsynth", extratags=extra
+        ),
+    )
 
 
 def write_exr(path: Path, channels: Mapping[str, np.ndarray]) -> None:
@@ -303,13 +367,4 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def write_tiff16(path: Path, image: np.ndarray) -> None:
     """Write (H, W) or (H, W, C) values in [0, 1] as 16-bit TIFF (zlib, any channel count); rounding as ``to_uint16``."""
     pixels = to_uint16(image)
-    if pixels.ndim == 3 and pixels.shape[2] == 1:
-        pixels = pixels[..., 0]
-    photometric = "rgb" if pixels.ndim == 3 and pixels.shape[2] == 3 else "minisblack"
-    planar = "contig" if pixels.ndim == 3 else None
-    write_atomic(
-        Path(path),
-        lambda temporary: tifffile.imwrite(
-            temporary, pixels, photometric=photometric, planarconfig=planar, compression="zlib", metadata=None
-        ),
-    )
+    write_tiff(path, pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels)

@@ -11,7 +11,8 @@ Facts of the format, and what is made of them:
 * Frames are kept by their ``frame_id``: ids may have gaps and modalities may have different views.
 
 Optional keys of a modality that MMS-DATA does not have and that describe any other sensor: ``channels`` (labels), ``wavelengths_nm``
-(a number or null per channel), ``polarizer_angles_deg`` (per channel, from image right towards image up).
+(a number or null per channel), ``polarizer_angles_deg`` (per channel, from image right towards image up). At the top: ``unit``, of the
+frame that ``worldtogt`` leads to, where it is not metres.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.files import read_json
+from mmsynth.files import read_json, write_json
 from mmsynth.scene.images import read_native, saturation_level
 from mmsynth.scene.poses import OPENGL_TO_OPENCV, number, rigid, whole
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, canonical_modality, make_split
@@ -65,6 +66,7 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
         raise InputError(f"{path}: key 'modalities' is missing or empty, expected an object with one entry per sensor.")
     raw, undistorted = _flag(meta, "raw", path), _flag(meta, "undistorted", path)
     to_output, scale, unit = _world_to_output(meta, path)
+    unit = str(meta.get("unit", unit))
     offset = number(meta, "pixel_offset", str(path)) if "pixel_offset" in meta else 0.0
 
     sources = {source: canonical_modality(source) for source in meta["modalities"]}
@@ -98,6 +100,61 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     centre = to_output[:3, 3]
     region = Region((float(centre[0]), float(centre[1]), float(centre[2])), scale * radius)
     return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
+
+
+def write_meta(
+    root: Path, sensors: Sequence[Sensor], frames: Mapping[str, Sequence[tuple[int, str, Camera, np.ndarray]]], region: Region, unit: str
+) -> None:
+    """Write the ``meta_data.json`` of a scene whose image files are there.
+
+    Args:
+        frames: by sensor, (view id, file name, camera, camera_to_world (4, 4) in the region's frame). region: becomes the scene box.
+    Raises:
+        InputError: what the format does not hold: a fisheye, k5 or k6, a sensor whose camera changes, frames with all channels
+            at every pixel beside mosaics, of a modality that is known to have one.
+    """
+    to_world = np.diag([1.0 / region.radius] * 3 + [1.0])
+    to_world[:3, 3] = -np.array(region.centre) / region.radius
+    raw = any(s.mosaic is not None for s in sensors)
+    modalities = {}
+    for sensor in sensors:
+        cameras = {camera for _, _, camera, _ in frames[sensor.name]}
+        if len(cameras) != 1:
+            raise InputError(
+                f"{root}: {len(cameras)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames of a sensor."
+            )
+        (camera,) = cameras
+        if camera.lens != "brown_conrady" or any(camera.coefficients[6:]):
+            raise InputError(
+                f"{root}: the lens of '{sensor.name}' does not fit MMS-DATA, which holds k1 k2 p1 p2 k3 k4 of Brown and Conrady."
+            )
+        if raw and sensor.mosaic is None and sensor.channel_count > 1 and sensor.name in _KNOWN:
+            raise InputError(f"{root}: '{sensor.name}' has no mosaic, which MMS-DATA does not hold beside sensors that have one.")
+        entry: dict[str, Any] = {
+            "camera_model": "OPENCV",
+            "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+            "distortion_params": camera.coefficients[:6].tolist(),
+            "channels": list(sensor.channels),
+            "wavelengths_nm": list(sensor.wavelengths_nm),
+        }  # fmt: skip
+        if raw and (sensor.mosaic is not None or sensor.channel_count == 1):
+            entry["mosaick_pattern"] = [[0]] if sensor.mosaic is None else sensor.mosaic.tolist()
+        if sensor.polarizer_angles_deg is not None:
+            entry["polarizer_angles_deg"] = list(sensor.polarizer_angles_deg)
+        entry["frames"] = []
+        for view, file_name, _, pose in frames[sensor.name]:
+            moved = pose.copy()
+            moved[:3, 3] = to_world[:3, :3] @ pose[:3, 3] + to_world[:3, 3]
+            entry["frames"].append({"frame_id": view, "file_name": file_name, "camtoworld": (moved @ OPENGL_TO_OPENCV)[:3].tolist()})
+        modalities[sensor.name] = entry
+    content = {
+        "undistorted": False, "raw": raw, "pixel_offset": 0.0,
+        "scene_box": {"collider_type": "sphere", "radius": 1.0, "aabb": [[-1.0] * 3, [1.0] * 3]},
+        "worldtogt": np.linalg.inv(to_world).tolist(),
+        "unit": unit,
+        "modalities": modalities,
+    }  # fmt: skip
+    write_json(root / "meta_data.json", content)
 
 
 def wanted_modalities(known: Iterable[str], asked: Sequence[str] | None, path: Path) -> set[str]:

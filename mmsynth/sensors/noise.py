@@ -6,7 +6,7 @@ numbers: y = K (electrons) + black, rounded and clipped. The variance of y follo
     σ_y² = K² σ_d² + 1 / 12 + K (μ_y - black) + PRNU² (μ_y - black)²
 
 Randomness is keyed by (seed, sensor, frame, effect): a frame does not depend on which others are made, in what order or batch, and the
-fixed pattern belongs to the sensor and not to the frame.
+fixed pattern belongs to the sensor and not to the frame. It is drawn on the CPU, so that every device records the same.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
+from pydantic import ConfigDict, with_config
 from torch import Tensor
 
 from mmsynth.errors import InputError
 
-_OF_THREE = 0.97334  # variance of a normal distribution cut at three standard deviations
 
-
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True)
 class NoiseModel:
     """A sensor's figures, names and units of EMVA 1288.
@@ -34,6 +33,8 @@ class NoiseModel:
         read_e: temporal dark noise σ_d [e-]. dark_e_s: dark current [e- / s], during exposure_s [s].
         row_e: noise that a row has in common [e-]. dsnu_e: spread of the dark signal between pixels [e-]. prnu: spread of their
             response, as a share of 1.
+        crosstalk: share of a pixel's electrons that is counted in each of its four neighbours (interpixel capacitance: the shot noise of
+            neighbours is correlated).
     """
 
     bits: int
@@ -46,6 +47,7 @@ class NoiseModel:
     row_e: float = 0.0
     dsnu_e: float = 0.0
     prnu: float = 0.0
+    crosstalk: float = 0.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.bits <= 16:
@@ -53,9 +55,11 @@ class NoiseModel:
         for name in ("gain_dn_e", "full_well_e"):
             if not getattr(self, name) > 0:
                 raise InputError(f"noise: {name} is {getattr(self, name)}, expected a positive number.")
-        for name in ("read_e", "black_dn", "dark_e_s", "exposure_s", "row_e", "dsnu_e", "prnu"):
+        for name in ("read_e", "black_dn", "dark_e_s", "exposure_s", "row_e", "dsnu_e", "prnu", "crosstalk"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"noise: {name} is {getattr(self, name)}, expected a number of at least 0.")
+        if self.crosstalk > 0.2:
+            raise InputError(f"noise: crosstalk is {self.crosstalk}, expected at most 0.2: a pixel keeps as much as each neighbour gets.")
         if not self.black_dn < self.white_dn:
             raise InputError(f"noise: black_dn is {self.black_dn}, expected less than full scale, {self.white_dn:g}.")
 
@@ -102,104 +106,20 @@ def record(light: Tensor, model: NoiseModel, frames: Sequence[int], sensor: str,
     expected = (electrons + dark.clamp(min=0.0)).detach().cpu().clamp(min=0.0)
     counted = [torch.poisson(e, generator=generator(seed, sensor, "shot", frame)) for e, frame in zip(expected, frames, strict=True)]
     noise = torch.stack(counted).to(light.device) - electrons.detach() + dark.clamp(max=0.0)
+    collected = electrons + noise
+    if model.crosstalk:
+        collected = _share_with_neighbours(collected, model.crosstalk)
     if model.read_e:
-        noise = noise + model.read_e * torch.stack([normal("read", frame) for frame in frames])
+        collected = collected + model.read_e * torch.stack([normal("read", frame) for frame in frames])
     if model.row_e:
-        noise = noise + model.row_e * torch.stack([normal("row", frame, (shape[0], 1)) for frame in frames])
-    held = (electrons + noise).clamp(max=model.full_well_e)
+        collected = collected + model.row_e * torch.stack([normal("row", frame, (shape[0], 1)) for frame in frames])
+    held = collected.clamp(max=model.full_well_e)
     numbers = (held * model.gain_dn_e + model.black_dn).clamp(0.0, model.white_dn)
     return numbers + (torch.round(numbers) - numbers).detach()
 
 
-@dataclass(frozen=True)
-class PhotonTransfer:
-    """What the variance of raw values tells of a sensor; each with its standard deviation.
-
-    Attributes:
-        gain_dn_e: K [DN / e-]. read_e: σ_d [e-], of all that does not depend on light. prnu: share. mean_dn, variance_dn2: the curve.
-    """
-
-    gain_dn_e: float
-    gain_sd: float
-    read_e: float
-    read_sd: float
-    prnu: float
-    prnu_sd: float
-    mean_dn: np.ndarray
-    variance_dn2: np.ndarray
-
-
-def photon_transfer(
-    raw: np.ndarray, expected: np.ndarray, bits: int, black_dn: float = 0.0, bins: int = 32, least: int = 50
-) -> PhotonTransfer:
-    """Fit the photon transfer equation to raw values and what they are expected to be.
-
-    Values are binned by their expectation; a bin's variance is that of raw - expected about its median, without what is farther off
-    than three standard deviations: pixels whose expectation is wrong (edges, a model that did not fit) do not count. Bins of which
-    the noise reaches the ends of the converter are left out.
-
-    Args:
-        raw: (N,) DN. expected: (N,) DN, black level included. bits: of the converter. least: values that a bin must have.
-    Raises:
-        InputError: too few values, or no range of light.
-    """
-    white = 2.0**bits - 1.0
-    usable = np.isfinite(expected) & (expected > black_dn) & (expected < white)
-    raw, expected = raw[usable].astype(np.float64), expected[usable].astype(np.float64)
-    bins = min(bins, len(raw) // least)
-    if bins < 4:
-        raise InputError(f"photon transfer: {len(raw)} usable values, expected at least {4 * least}.")
-    # as many values in each: dark ones, which tell the read noise, are many
-    edges = np.unique(np.quantile(expected, np.linspace(0, 1, bins + 1)))
-    index = np.clip(np.searchsorted(edges, expected, side="right") - 1, 0, len(edges) - 2)
-    mean, variance, weight = [], [], []
-    for b in range(len(edges) - 1):
-        difference, here = (raw - expected)[index == b], expected[index == b]
-        if len(here) < least:
-            continue
-        spread = _variance(difference)
-        if here.min() < 3.0 * spread**0.5 or here.max() > white - 3.0 * spread**0.5:
-            continue
-        mean.append(float(here.mean()) - black_dn)
-        variance.append(spread)
-        weight.append(len(here) / 2.0)  # the variance of a variance of n normal values is 2 σ⁴ / n
-    if len(mean) < 4 or max(mean) < 2.0 * min(mean):
-        raise InputError("photon transfer: the values have no range of light, expected bright and dark ones.")
-    mu, v, n = np.array(mean), np.array(variance), np.array(weight)
-    design = np.stack([np.ones_like(mu), mu, mu**2], 1)
-    predicted = v
-    for _ in range(10):  # weights are those of the fitted curve
-        scale = np.sqrt(n) / np.maximum(predicted, 1e-3)
-        solution, _ = nnls(design * scale[:, None], (v - 1.0 / 12.0).clip(min=0.0) * scale)
-        predicted = design @ solution + 1.0 / 12.0
-    free = solution > 0
-    covariance = np.zeros((3, 3))
-    covariance[np.ix_(free, free)] = np.linalg.pinv((design * scale[:, None])[:, free].T @ (design * scale[:, None])[:, free])
-    constant, gain, square = (float(x) for x in solution)
-    if gain <= 0:
-        raise InputError("photon transfer: the variance does not grow with light, expected shot noise.")
-    read, prnu = np.sqrt(constant) / gain, np.sqrt(square)
-    # of a root, by the variance of its square; of a root that is 0, what its square might be
-    gradient = np.array([0.5 / (np.sqrt(constant) * gain) if constant > 0 else 0.0, -np.sqrt(constant) / gain**2, 0.0])
-    return PhotonTransfer(
-        gain_dn_e=gain,
-        gain_sd=float(np.sqrt(covariance[1, 1])),
-        read_e=float(read),
-        read_sd=float(np.sqrt(gradient @ covariance @ gradient)),
-        prnu=float(prnu),
-        prnu_sd=float(0.5 * np.sqrt(covariance[2, 2]) / prnu) if prnu > 0 else 0.0,
-        mean_dn=mu + black_dn,
-        variance_dn2=v,
-    )
-
-
-def _variance(values: np.ndarray) -> float:
-    """Variance about the median, of what lies within three standard deviations, as if the others were a normal distribution's."""
-    low, middle, high = np.quantile(values, (0.1587, 0.5, 0.8413))
-    # whole numbers have steps in their quantiles: never less than the spread of rounding
-    limit = 3.0 * max(0.5 * (high - low), 12.0**-0.5)
-    for _ in range(5):
-        within = values[np.abs(values - middle) <= limit] - middle
-        variance = float(np.mean(within**2)) / _OF_THREE
-        limit = 3.0 * max(variance**0.5, 12.0**-0.5)
-    return variance
+def _share_with_neighbours(electrons: Tensor, share: float) -> Tensor:
+    """(B, H, W): each of the four neighbours gets a share; what would leave the frame stays."""
+    kernel = electrons.new_tensor([[0.0, share, 0.0], [share, 1.0 - 4.0 * share, share], [0.0, share, 0.0]])
+    padded = torch.nn.functional.pad(electrons[:, None], (1, 1, 1, 1), mode="replicate")
+    return torch.nn.functional.conv2d(padded, kernel[None, None])[:, 0]

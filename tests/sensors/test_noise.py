@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from mmsynth.errors import InputError
-from mmsynth.sensors.noise import NoiseModel, generator, photon_transfer, record
+from mmsynth.sensors.noise import NoiseModel, generator, record
+from mmsynth.sensors.photon_transfer import photon_transfer
 
 CAMERA = NoiseModel(bits=12, gain_dn_e=0.4, full_well_e=10500.0, read_e=5.0, black_dn=64.0)
 
