@@ -33,7 +33,7 @@ from mmsynth.operations.dataset import field_hash
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import write_dng, write_png, write_tiff
-from mmsynth.scene.mmsdata import write_meta
+from mmsynth.scene.mmsdata import meta_content
 from mmsynth.scene.scene import Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.mosaic import crop_pattern, is_bayer
@@ -384,27 +384,26 @@ def _write(
 ) -> Path:
     known = field_hash(field)
     count = Counter(progress, sum(p.supersampling**2 * camera.width * camera.height for p, camera, _, _ in requests))
-    listing: dict[str, list[tuple[int, str, Camera, np.ndarray]]] = {p.sensor.name: [] for p in planned}
-    # ids before anything is made: two frames of one id would overwrite each other
-    ids = {p.sensor.name: _ids([name for q, _, _, name in requests if q is p]) for p in planned}
+    frames: list[tuple[Simulated, int, Camera, np.ndarray]] = []
+    for p in planned:
+        own = [(camera, pose, name) for q, camera, pose, name in requests if q is p]
+        frames += [(p, i, camera, pose) for i, (camera, pose, _) in zip(_ids([name for _, _, name in own]), own, strict=True)]
+    listing = {p.sensor.name: [(i, f"{i:04d}.{format}", camera, pose) for q, i, camera, pose in frames if q is p] for p in planned}
+    content = meta_content(out, [p.sensor for p in planned], listing, field.region, field.unit)
     (out / "meta_data.json").unlink(missing_ok=True)  # it must not vouch for frames of another request
     for p in planned:
         write_text(out / "sensors" / f"{p.sensor.name}.toml", sensor_to_toml(p.file))
-    for p, camera, pose, _ in requests:
+    for p, i, camera, pose in frames:
         name = p.sensor.name
-        frame = ids[name][len(listing[name])]
         goal = count.done + p.supersampling**2 * camera.width * camera.height
-        path = out / "modalities" / name / f"{frame:04d}.{format}"
-        sidecar = out / "sidecars" / name / f"{frame:04d}.json"
-        facts = _facts(p, camera, pose, frame, seed, known)
+        path, sidecar = out / "modalities" / name / f"{i:04d}.{format}", out / "sidecars" / name / f"{i:04d}.json"
+        facts = _facts(p, camera, pose, i, seed, known)
         if not _finished(sidecar, facts, path):
             sidecar.unlink(missing_ok=True)
-            numbers = simulate_frame(field, p, camera, pose, frame, seed, count)
-            _write_frame(path, numbers, p)
+            _write_frame(path, simulate_frame(field, p, camera, pose, i, seed, count), p)
             write_json(sidecar, {**facts, "file": f"modalities/{name}/{path.name}", "sha256": sha256_of(path)})
-        listing[name].append((frame, path.name, camera, pose))
         count(goal - count.done)
-    write_meta(out, [p.sensor for p in planned], listing, field.region, field.unit)
+    write_json(out / "meta_data.json", content)
     return out / "meta_data.json"
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.files import read_json, write_json
+from mmsynth.files import read_json
 from mmsynth.scene.images import read_native, saturation_level
 from mmsynth.scene.poses import OPENGL_TO_OPENCV, number, rigid, whole
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, canonical_modality, make_split
@@ -102,13 +102,14 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
 
 
-def write_meta(
+def meta_content(
     root: Path, sensors: Sequence[Sensor], frames: Mapping[str, Sequence[tuple[int, str, Camera, np.ndarray]]], region: Region, unit: str
-) -> None:
-    """Write the ``meta_data.json`` of a scene whose image files are there.
+) -> dict[str, Any]:
+    """What ``meta_data.json`` says of a scene: the content of the file, that ``write_json`` takes.
 
     Args:
-        frames: by sensor, (view id, file name, camera, camera_to_world (4, 4) in the region's frame). region: becomes the scene box.
+        root: to name in errors. region: becomes the scene box.
+        frames: by sensor, (view id, file name, camera, camera_to_world (4, 4) in the region's frame).
     Raises:
         InputError: what the format does not hold: a fisheye, k5 or k6, a sensor whose camera changes, frames with all channels
             at every pixel beside mosaics, of a modality that is known to have one.
@@ -147,14 +148,13 @@ def write_meta(
             moved[:3, 3] = to_world[:3, :3] @ pose[:3, 3] + to_world[:3, 3]
             entry["frames"].append({"frame_id": view, "file_name": file_name, "camtoworld": (moved @ OPENGL_TO_OPENCV)[:3].tolist()})
         modalities[sensor.name] = entry
-    content = {
+    return {
         "undistorted": False, "raw": raw, "pixel_offset": 0.0,
         "scene_box": {"collider_type": "sphere", "radius": 1.0, "aabb": [[-1.0] * 3, [1.0] * 3]},
         "worldtogt": np.linalg.inv(to_world).tolist(),
         "unit": unit,
         "modalities": modalities,
     }  # fmt: skip
-    write_json(root / "meta_data.json", content)
 
 
 def wanted_modalities(known: Iterable[str], asked: Sequence[str] | None, path: Path) -> set[str]:
