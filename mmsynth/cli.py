@@ -476,6 +476,22 @@ def bench_numerics(
     _print_report(report, as_json)
 
 
+@command("twin", of=bench_app)
+def bench_twin(
+    only: Annotated[str | None, typer.Option(help="effects, optics, supersampling, calibration, spectra; default: all")] = None,
+    run: Annotated[Path | None, typer.Option(help="a fitted field, whose supersampling is measured too")] = None,
+    out: Annotated[Path, typer.Option()] = Path("bench/twin"),
+    as_json: JsonOption = False,
+) -> None:
+    """The sensor's twin: ns per pixel of every effect against its closed form, supersampling, self-calibration, virtual channels."""
+    from mmsynth.bench.twin import bench_twin as measure
+
+    field = None if run is None else _load_field(run)[1]
+    with _bar("bench twin", as_json) as show:
+        report = measure(out, field, None if only is None else [name.strip() for name in only.split(",")], progress=show)
+    _print_report(report, as_json)
+
+
 def _print_report(report: Any, as_json: bool) -> None:
     from mmsynth.bench.tables import print_tables
 

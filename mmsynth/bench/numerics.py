@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +19,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from mmsynth.bench.machine import measure, use_threads
+from mmsynth.bench.machine import measure
+from mmsynth.bench.methods import REPEATS, Method, measured
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
-from mmsynth.errors import InputError
 from mmsynth.field.kernels import reference
 from mmsynth.operations.progress import Progress
 from mmsynth.sensors import lenses
@@ -39,27 +36,8 @@ from mmsynth.sensors.polarization import (
     stokes_to_intensities,
 )
 
-REPEATS = 7
 _RGGB = np.array([[0, 1], [1, 2]])
 _POL, _POL_ANGLES = np.array([[2, 1], [3, 0]]), (0.0, 45.0, 90.0, 135.0)
-
-
-@dataclass(frozen=True)
-class Method:
-    """One way to compute something.
-
-    Attributes:
-        problem: what on. name: how. run: the computation. judge: its result → ``error`` (typical), ``worst`` and what else the table has.
-        count: elements of a run; times are per element.
-    """
-
-    family: str
-    problem: str
-    name: str
-    run: Callable[[], Any]
-    judge: Callable[[Any], dict[str, float]]
-    count: int
-    unit: str
 
 
 def _typical(error: np.ndarray) -> dict[str, float]:
@@ -312,50 +290,9 @@ def bench_numerics(out: Path, only: Sequence[str] | None = None, repeats: int = 
     Raises:
         InputError: an unknown name, or ``out`` cannot be written.
     """
-    known = {family.__name__: family for family in FAMILIES}
-    for name in only or ():
-        if name not in known:
-            raise InputError(f"bench numerics: no family {name!r}, expected some of {', '.join(known)}.")
-    methods = [method for name, family in known.items() if only is None or name in only for method in family()]
-    rows = []
-    groups = _groups(methods)
-    threads = cv2.getNumThreads()
-    try:
-        cv2.setNumThreads(1)
-        with use_threads(1):
-            for done, group in enumerate(groups, 1):
-                rows += _measured(group, repeats)
-                if progress is not None:
-                    progress(done, len(groups))
-    finally:
-        cv2.setNumThreads(threads)
+    rows = measured(FAMILIES, "numerics", only, repeats, progress)
     results = {"bench": "numerics", "machine": measure(), "rows": rows, "repeats": repeats}
     return write_report(results, tables_of(rows), plot(rows), out)
-
-
-def _groups(methods: Sequence[Method]) -> list[list[Method]]:
-    """Methods of one problem."""
-    groups: dict[tuple[str, str], list[Method]] = {}
-    for method in methods:
-        groups.setdefault((method.family, method.problem), []).append(method)
-    return list(groups.values())
-
-
-def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
-    times: list[list[float]] = [[] for _ in group]
-    judged = [method.judge(method.run()) for method in group]
-    for _ in range(repeats):
-        for method, taken in zip(group, times, strict=True):
-            began = time.perf_counter()
-            method.run()
-            taken.append(time.perf_counter() - began)
-    return [
-        {
-            "family": method.family, "problem": method.problem, "method": method.name, "unit": method.unit,
-            "ns": statistics.median(taken) / method.count * 1e9, **found,
-        }
-        for method, taken, found in zip(group, times, judged, strict=True)
-    ]  # fmt: skip
 
 
 def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:

@@ -1,0 +1,94 @@
+"""Ways to compute something, timed beside each other: speed against error.
+
+Speeds are medians of repeats in which the methods of one problem take turns, on one thread, per element.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+
+from mmsynth.bench.machine import use_threads
+from mmsynth.errors import InputError
+from mmsynth.operations.progress import Progress
+
+REPEATS = 7
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to compute something.
+
+    Attributes:
+        problem: what on. name: how. run: the computation. judge: its result → ``error`` (typical), ``worst`` and what else the table has.
+        count: elements of a run; times are per element.
+    """
+
+    family: str
+    problem: str
+    name: str
+    run: Callable[[], Any]
+    judge: Callable[[Any], dict[str, float]]
+    count: int
+    unit: str
+
+
+def measured(
+    families: Sequence[Callable[[], list[Method]]], bench: str, only: Sequence[str] | None, repeats: int, progress: Progress | None
+) -> list[dict[str, Any]]:
+    """Run all families, or those whose functions are named in ``only``; one row per method.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    known = {family.__name__: family for family in families}
+    for name in only or ():
+        if name not in known:
+            raise InputError(f"bench {bench}: no family {name!r}, expected some of {', '.join(known)}.")
+    return measured_methods([m for name, family in known.items() if only is None or name in only for m in family()], repeats, progress)
+
+
+def measured_methods(methods: Sequence[Method], repeats: int, progress: Progress | None) -> list[dict[str, Any]]:
+    """One row per method."""
+    rows, groups = [], _groups(methods)
+    threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        with use_threads(1):
+            for done, group in enumerate(groups, 1):
+                rows += _measured(group, repeats)
+                if progress is not None:
+                    progress(done, len(groups))
+    finally:
+        cv2.setNumThreads(threads)
+    return rows
+
+
+def _groups(methods: Sequence[Method]) -> list[list[Method]]:
+    """Methods of one problem."""
+    groups: dict[tuple[str, str], list[Method]] = {}
+    for method in methods:
+        groups.setdefault((method.family, method.problem), []).append(method)
+    return list(groups.values())
+
+
+def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
+    times: list[list[float]] = [[] for _ in group]
+    judged = [method.judge(method.run()) for method in group]
+    for _ in range(repeats):
+        for method, taken in zip(group, times, strict=True):
+            began = time.perf_counter()
+            method.run()
+            taken.append(time.perf_counter() - began)
+    return [
+        {
+            "family": method.family, "problem": method.problem, "method": method.name, "unit": method.unit,
+            "ns": statistics.median(taken) / method.count * 1e9, **found,
+        }
+        for method, taken, found in zip(group, times, judged, strict=True)
+    ]  # fmt: skip
