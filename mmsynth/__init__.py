@@ -20,16 +20,21 @@ if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
     from mmsynth.fitting.trainer import fit
+    from mmsynth.operations.calibrate_noise import calibrate_noise
     from mmsynth.operations.convert import convert
     from mmsynth.operations.dataset import generate_dataset
     from mmsynth.operations.evaluate import evaluate
     from mmsynth.operations.mesh import extract_mesh, write_mesh
+    from mmsynth.operations.simulate import simulate
     from mmsynth.scene.load import load_scene
+    from mmsynth.sensors.twin import SensorTwin
 
 _HOMES = {
     "InputError": "errors",
     "Field": "field.field",
     "Rendering": "field.field",
+    "SensorTwin": "sensors.twin",
+    "calibrate_noise": "operations.calibrate_noise",
     "Recipe": "fitting.recipe",
     "load_recipe": "fitting.recipe",
     "fit": "fitting.trainer",
@@ -45,6 +50,8 @@ __all__ = [
     "InputError",
     "Recipe",
     "Rendering",
+    "SensorTwin",
+    "calibrate_noise",
     "convert",
     "evaluate",
     "extract_mesh",
@@ -52,6 +59,7 @@ __all__ = [
     "generate_dataset",
     "load_recipe",
     "load_scene",
+    "simulate",
     "write_mesh",
 ]
 

@@ -58,7 +58,8 @@ class Calibrated:
     def comments(self) -> tuple[str, ...]:
         """For the head of the file: what is known how well."""
         p, noise = self.found, self.file.noise
-        at_most = lambda value, sd, unit: f"{value:.3g} ± {sd:.2g} {unit}" if value > 0 else f"not told, below about {sd:.2g} {unit}"
+        below = lambda sd, unit: "not told" if sd >= 100 else f"not told, below about {sd:.2g} {unit}"
+        at_most = lambda value, sd, unit: f"{value:.3g} ± {sd:.2g} {unit}" if value > 0 else below(sd, unit)
         return (
             f"noise: photon transfer of {self.frames} frames (mmsynth calibrate-noise), with one standard deviation:",
             f"gain {p.gain_dn_e:.4g} ± {p.gain_sd:.2g} DN/e-, full scale {noise.electrons_at_one:.0f} e-",

@@ -48,6 +48,7 @@ FORMATS = ("png", "tiff", "dng")
 RIGS = ("native", "aligned")
 VIRTUAL_SUPERSAMPLING = 2
 _STRIP_RAYS = 1 << 18
+IN_THE_FIELD = ("response", "exposure", "psf", "aperture", "vignetting", "analysers", "crosstalk")  # of a sensor that it learned from
 STAGES = (
     "psf", "aperture", "exposure", "vignetting", "mosaic", "analyser", "prnu", "shot noise of light and dark current", "crosstalk",
     "read noise", "row noise", "full well", "gain", "black level", "rounding",
@@ -420,6 +421,7 @@ def _facts(planned: Simulated, camera: Camera, pose: np.ndarray, frame: int, see
         "seed": seed,
         "supersampling": planned.supersampling,
         "stages": list(STAGES),
+        "in_the_field": list(IN_THE_FIELD) if planned.file.kind == "instance" else [],
         "analysers": "of the file" if planned.polarized else "of the field" if planned.sensor.is_polarization else None,
         "channels_made_of": {
             label: {"residual": c.residual, "noise_gain": c.noise_gain, "weights": c.weights.tolist()}

@@ -36,9 +36,13 @@ def score_text(scores: Mapping[str, Any]) -> str:
 
 
 def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
-    """The result of ``calibrate-noise``: one row per sensor, with standard deviations; "<": not told, and what would have been seen."""
+    """The result of ``calibrate-noise``: one row per sensor, with standard deviations; "<": not told, and what would have been seen;
+    "–": one frame alone tells no pattern."""
     lines = [f"{'sensor':14s}{'frames':>7s}{'bits':>5s}{'gain [DN/e-]':>22s}{'full scale [e-]':>20s}{'read [e-]':>14s}{'PRNU [%]':>14s}"]
-    pair = lambda value, sd, digits: f"{value:.{digits}f} ± {sd:.{digits}f}" if value > 0 else f"< {sd:.{digits}f}"
+
+    def pair(value: float, sd: float, digits: int) -> str:
+        return f"{value:.{digits}f} ± {sd:.{digits}f}" if value > 0 else "–" if sd >= 100.0 else f"< {sd:.{digits}f}"
+
     for name, c in calibrated.items():
         p, noise = c.found, c.file.noise
         full = noise.electrons_at_one

@@ -101,3 +101,11 @@ def test_bench_numerics(tmp_path: Path) -> None:
     assert results["out"] == "bench/numerics" and {row["family"] for row in results["rows"]} == {"angles", "resampling"}
     assert {path.name for path in (tmp_path / "bench" / "numerics").iterdir()} == {"results.json", "report.md", "plot.svg"}
     refused(call("bench", "numerics", "--only", "magic"), "'magic'", "undistortion")
+
+
+def test_bench_twin(tmp_path: Path) -> None:
+    result = call("bench", "twin", "--only", "optics,spectra", "--out", "here")
+    assert result.exit_code == 0 and "wrote here/" in result.output, result.output
+    assert {path.name for path in (tmp_path / "here").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    refused(call("bench", "twin", "--only", "magic"), "'magic'", "effects")
+    refused(call("bench", "twin", "--run", "nowhere"), "nowhere", "no finished fit")

@@ -97,6 +97,69 @@ def test_generate_dataset_resumes_and_verifies(fitted: Path) -> None:
     refused(run(fitted, "generate-dataset", "--poses", "poses.json", "--verify"), "problem")
 
 
+MONO_TOML = """name = "nir"
+instance_of = "nir"
+[noise]
+bits = 12
+gain_dn_e = 0.4
+full_well_e = 12000.0
+read_e = 5.0
+"""
+
+
+def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path) -> None:
+    sensors = [json.loads(run(fitted, "info", "example", "--json").stdout)["sensors"]][0]
+    name = next(n for n, s in sensors.items() if s["mosaic"] is None)
+    (fitted / "own.toml").write_text(MONO_TOML.replace("nir", name))
+    rgb = MONO_TOML.replace("nir", "rgb").replace("own", "rgb")
+    (fitted / "rgb.toml").write_text(rgb)
+    result = run(fitted, "simulate", "--sensor", "own.toml", "--sensor", "rgb.toml", "--views", "all", "--json")
+    assert result.returncode == 0, result.stderr
+    out = Path(json.loads(result.stdout)["scene"])
+    assert out == Path("runs/latest/simulated")
+    again = json.loads(run(fitted, "info", str(out), "--json").stdout)
+    assert set(again["sensors"]) == {name, "rgb"} and not again["problems"]
+    assert all(again["sensors"][n]["frames"] == sensors[n]["frames"] for n in again["sensors"])
+    assert again["sensors"]["rgb"]["bits"] == 12 and again["sensors"]["rgb"]["mosaic"] == sensors["rgb"]["mosaic"]
+    assert run(fitted, "fit", str(out), "--steps", "3", "--run", "again").returncode == 0
+    # a trajectory, a packaged virtual camera, DNG
+    (fitted / "orbit.json").write_text('{"trajectory": "orbit", "views": 3}')
+    small = (data_folder("recipes") / "sensors" / "bayer_rgb.toml").read_text()
+    small = small.replace("width = 1440", "width = 72").replace("height = 1080", "height = 54").replace("1739.1", "87.0")
+    (fitted / "small.toml").write_text(small.replace("cx = 719.5", "cx = 35.5").replace("cy = 539.5", "cy = 26.5"))
+    result = run(fitted, "simulate", "--sensor", "small.toml", "--poses", "orbit.json", "--format", "dng", "--out", "dng", "--seed", "5")
+    assert result.returncode == 0 and "wrote dng/" in result.stdout, result.stderr
+    assert sorted(p.name for p in (fitted / "dng" / "modalities" / "bayer_rgb").iterdir()) == ["0000.dng", "0001.dng", "0002.dng"]
+
+
+def test_bad_simulations_are_refused(fitted: Path) -> None:
+    (fitted / "psf.toml").write_text(MONO_TOML.replace("nir", "rgb").replace("[noise]", "psf_sigma_px = 1.0\n[noise]"))
+    (fitted / "key.toml").write_text(MONO_TOML.replace("read_e", "read_noise"))
+    refused(run(fitted, "simulate", "--sensor", "psf.toml"), "one of --poses and --views")
+    refused(run(fitted, "simulate", "--sensor", "psf.toml", "--views", "test"), "psf.toml", "psf_sigma_px", "--delta")
+    refused(run(fitted, "simulate", "--sensor", "key.toml", "--views", "test"), "key.toml", "read_noise")
+    refused(run(fitted, "simulate", "--sensor", "nothing", "--views", "test"), "nothing", "bayer_rgb")
+    refused(run(fitted, "simulate", "--sensor", "rgb.toml", "--views", "test", "--rig", "aligned"), "--rig")
+    refused(run(fitted, "simulate", "--sensor", "rgb.toml", "--views", "777"), "777")
+
+
+def test_calibrate_noise(fitted: Path) -> None:
+    result = run(fitted, "calibrate-noise", "--modalities", "rgb", "--out", "sensors")
+    assert result.returncode == 0, result.stderr
+    assert "gain [DN/e-]" in result.stdout and "wrote sensors/ (rgb.toml, noise.svg)" in result.stdout
+    assert {p.name for p in (fitted / "sensors").iterdir()} == {"rgb.toml", "noise.svg", "noise.json"}
+    again = run(fitted, "simulate", "--sensor", "sensors/rgb.toml", "--views", "test", "--out", "calibrated", "--json")
+    assert again.returncode == 0, again.stderr
+    frames = sorted(str(p) for p in (data_folder("example_scene") / "modalities" / "rgb").iterdir())[:3]
+    (fitted / "described.toml").write_text(
+        (fitted / "sensors" / "rgb.toml").read_text().replace("[noise]", "mosaic = [[1, 2], [0, 1]]\n[noise]")
+    )
+    alone = run(fitted, "calibrate-noise", "--sensor", "described.toml", *frames, "--json")
+    assert alone.returncode == 0 and json.loads(alone.stdout)["sensors"]["rgb"]["frames"] == 3, alone.stderr
+    refused(run(fitted, "calibrate-noise", *frames), "expected one --sensor")
+    refused(run(fitted, "calibrate-noise", "--raw", "nowhere"), "nowhere", "no frames")
+
+
 def test_mesh(fitted: Path) -> None:
     import trimesh
 

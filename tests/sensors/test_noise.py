@@ -1,4 +1,4 @@
-"""Noise in closed form: means, variances, correlations, and the photon transfer curve that gives the figures back."""
+"""Noise in closed form: means, variances, correlations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import torch
 
 from mmsynth.errors import InputError
 from mmsynth.sensors.noise import NoiseModel, generator, record
-from mmsynth.sensors.photon_transfer import photon_transfer
 
 CAMERA = NoiseModel(bits=12, gain_dn_e=0.4, full_well_e=10500.0, read_e=5.0, black_dn=64.0)
 
@@ -70,6 +69,82 @@ def test_saturation_and_black_clip() -> None:
     assert dark.min() == 0 and 0.5 < (dark == 0).mean() < 0.8  # half and what rounds to 0
 
 
+# --- crosstalk
+
+
+def _correlation(flat: np.ndarray, row: int, column: int) -> float:
+    """Of what is left of a flat field (frames, H, W) with what is left so many rows and columns on."""
+    height, width = flat.shape[1:]
+    one, other = flat[:, : height - row, : width - column], flat[:, row:, column:]
+    return float((one * other).mean() / flat.var())
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.2])
+def test_crosstalk_correlates_the_shot_noise_of_neighbours(share: float) -> None:
+    """The kernel (1 - 4c, four times c) on white noise: its autocorrelation. 0.2 is the most: all five the same."""
+    raw = _flat(0.3, NoiseModel(16, 1.0, 1e6, crosstalk=share), frames=4)
+    electrons, own = 0.3 * (2**16 - 1), 1.0 - 4.0 * share
+    power = own**2 + 4 * share**2
+    expected = {
+        (0, 1): 2 * share * own,
+        (1, 0): 2 * share * own,
+        (1, 1): 2 * share**2,
+        (0, 2): share**2,
+        (2, 0): share**2,
+        (0, 3): 0,
+        (2, 1): 0,
+    }
+    # crosstalk moves electrons and loses none: the mean is known as well as without it
+    assert abs(raw.mean() - electrons) < 4 * math.sqrt((electrons + 1 / 12) / raw.size)
+    left = (raw - electrons)[:, 1:-1, 1:-1]
+    # of n values with the correlations ρ, a variance is known to √(2 Σ ρ² / n), and a correlation at least as well
+    rho2 = 1 + (4 * (2 * share * own) ** 2 + 4 * (2 * share**2) ** 2 + 4 * share**4) / power**2
+    sd = math.sqrt(2 * rho2 / left.size)
+    assert left.var() == pytest.approx(electrons * power + 1 / 12, rel=4 * sd)
+    for (row, column), covariance in expected.items():
+        assert abs(_correlation(left, row, column) - covariance / power) < 4 * sd
+
+
+def test_crosstalk_keeps_what_would_leave_the_frame() -> None:
+    """Mean as elsewhere; a pixel at a border keeps 1 - 3c, in a corner 1 - 2c."""
+    share, frames = 0.1, 300
+    raw = _flat(0.3, NoiseModel(16, 1.0, 1e6, crosstalk=share), (12, 15), frames)
+    electrons = 0.3 * (2**16 - 1)
+    edge = np.concatenate([raw[:, 0, 3:-3:3], raw[:, -1, 3:-3:3], raw[:, 3:-3:3, 0], raw[:, 3:-3:3, -1]], 1)
+    corners = raw[:, [0, 0, -1, -1], [0, -1, 0, -1]]
+    for part, kept in ((edge, 3), (corners, 2)):
+        power = (1 - kept * share) ** 2 + kept * share**2
+        assert abs(part.mean() - electrons) < 4 * math.sqrt(electrons * power / part.size)
+        assert part.var() == pytest.approx(electrons * power, rel=4 * math.sqrt(2 / part.size))
+
+
+def test_crosstalk_shares_the_light_of_a_point_and_nothing_else() -> None:
+    model = NoiseModel(16, 1e-3, 1e9, black_dn=100.0, crosstalk=0.1)
+    light = torch.zeros(1, 9, 9, dtype=torch.float64)
+    light[0, 4, 4] = light[0, 0, 0] = 0.5
+    raw = record(light, model, [0], "cam")[0].numpy() - 100.0
+    assert raw.sum() == pytest.approx(65435, abs=4 * math.sqrt(65435 * 1e-3) + 3)  # K² of the electrons, and rounding
+    full = 0.5 * 65435
+    around = {(4, 4): 0.6, (3, 4): 0.1, (5, 4): 0.1, (4, 3): 0.1, (4, 5): 0.1, (0, 0): 0.8, (0, 1): 0.1, (1, 0): 0.1}
+    for at, share in around.items():
+        assert raw[at] == pytest.approx(share * full, abs=4 * share * math.sqrt(full * 1e-3) + 0.5)
+        raw[at] = 0.0
+    assert not raw.any()
+    # read noise comes after it and belongs to one pixel
+    dark = _flat(0.0, NoiseModel(16, 1.0, 1e6, read_e=20.0, black_dn=1000.0, crosstalk=0.2))
+    assert dark.var() == pytest.approx(400 + 1 / 12, rel=4 * math.sqrt(2 / dark.size))
+    assert abs(_correlation(dark - dark.mean(), 0, 1)) < 4 / math.sqrt(dark.size)
+
+
+def test_crosstalk_up_to_a_fifth_is_accepted() -> None:
+    assert NoiseModel(12, 0.4, 1e4, crosstalk=0.2).crosstalk == 0.2
+    with pytest.raises(InputError, match=r"crosstalk is 0\.21, expected at most 0\.2"):
+        NoiseModel(12, 0.4, 1e4, crosstalk=0.21)
+
+
+# --- keys, gradients, refusals
+
+
 def test_a_frame_depends_on_its_key_alone() -> None:
     model = NoiseModel(12, 0.4, 9000.0, 5.0, 64.0, 10.0, 1.0, 2.0, 3.0, 0.01)
     light = torch.rand(5, 20, 30, dtype=torch.float64)
@@ -92,39 +167,7 @@ def test_gradients_pass_noise_and_end_at_saturation() -> None:
     assert light.grad.tolist() == [[[4031.0, 4031.0, 0.0]]]  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("prnu", [0.0, 0.01])
-@pytest.mark.parametrize("wrong", [0.0, 0.05])
-def test_the_curve_gives_the_figures_back(prnu: float, wrong: float) -> None:
-    """Also when some pixels are far from what they were expected to be, as at edges of a field."""
-    model = NoiseModel(12, 0.4, 10500.0, 5.0, 64.0, prnu=prnu)
-    random = np.random.default_rng(0)
-    light = torch.from_numpy(random.random((4, 200, 250)) ** 2)
-    raw = record(light, model, range(4), "cam").numpy().ravel()
-    expected = (64 + light.numpy() * (4095 - 64)).ravel()
-    outliers = random.random(len(raw)) < wrong
-    raw[outliers] = np.clip(raw[outliers] + random.normal(0, 400, outliers.sum()), 0, 4095)
-    found = photon_transfer(raw, expected, 12, 64.0)
-    loose = 1.0 if wrong == 0 else 2.5
-    assert found.gain_dn_e == pytest.approx(0.4, rel=0.02 * loose)
-    assert found.read_e == pytest.approx(5.0, rel=0.1 * loose)
-    assert found.prnu == pytest.approx(prnu, abs=0.0035)
-    if wrong == 0:
-        assert abs(found.gain_dn_e - 0.4) < 4 * found.gain_sd and 0 < found.gain_sd < 0.01
-        assert abs(found.read_e - 5.0) < 4 * found.read_sd and 0 < found.read_sd < 0.5
-
-
 def test_figures_that_cannot_be_are_refused() -> None:
-    for wrong in ({"bits": 17}, {"gain_dn_e": 0.0}, {"read_e": -1.0}, {"black_dn": 5000.0}, {"prnu": math.nan}):
+    for wrong in ({"bits": 17}, {"gain_dn_e": 0.0}, {"read_e": -1.0}, {"black_dn": 5000.0}, {"prnu": math.nan}, {"crosstalk": 0.21}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             NoiseModel(**{"bits": 12, "gain_dn_e": 0.4, "full_well_e": 1e4, **wrong})  # type: ignore[arg-type]
-
-
-def test_values_that_tell_nothing_are_refused() -> None:
-    with pytest.raises(InputError, match="usable values"):
-        photon_transfer(np.full(20, 100.0), np.full(20, 100.0), 12)
-    with pytest.raises(InputError, match="no range of light"):
-        photon_transfer(_flat(0.3).ravel(), np.full(50000, 64 + 0.3 * 4031), 12, 64.0)
-    random = np.random.default_rng(0)
-    flat = random.uniform(200, 3000, 50000)
-    with pytest.raises(InputError, match="does not grow with light"):
-        photon_transfer(flat + 5 * np.sqrt(3200 - flat) * random.normal(size=50000) / 10, flat, 12)

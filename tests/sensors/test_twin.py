@@ -112,7 +112,9 @@ def test_kernel_is_the_gaussians_mean_over_each_pixel(sigma: float) -> None:
     variance = float((kernel.sum(0) * at**2).sum())
     wave = 2.0 * math.pi * sigma
     # of a rounded normal number, first terms of the Fourier series
-    rounded = sigma**2 + 1 / 12 + sum((-1) ** k * (4 * sigma**2 + 1 / (math.pi * k) ** 2) * math.exp(-0.5 * (wave * k) ** 2) for k in (1, 2, 3))
+    rounded = (
+        sigma**2 + 1 / 12 + sum((-1) ** k * (4 * sigma**2 + 1 / (math.pi * k) ** 2) * math.exp(-0.5 * (wave * k) ** 2) for k in (1, 2, 3))
+    )
     assert -1e-6 <= rounded - variance <= 1.1 * _beyond(sigma)
 
 
@@ -261,7 +263,9 @@ def test_malus_through_the_twin() -> None:
     """Light at ψ behind an analyser at θ: cos²(θ - ψ)."""
     file = _sensor(polarizers=tuple(Polarizer(angle_deg=a) for a in ANGLES))
     psi = math.radians(30.0)
-    stokes = torch.tensor([1.0, math.cos(2 * psi), math.sin(2 * psi)], dtype=torch.float64)[None, None, :, None, None].expand(1, 4, 3, 30, 40)
+    stokes = torch.tensor([1.0, math.cos(2 * psi), math.sin(2 * psi)], dtype=torch.float64)[None, None, :, None, None].expand(
+        1, 4, 3, 30, 40
+    )
     raw = SensorTwin(file, PINHOLE, POL, analysers=True).expose(stokes)[0]
     for (row, column), channel in np.ndenumerate(POL):
         expected = math.cos(math.radians(ANGLES[channel]) - psi) ** 2
