@@ -350,6 +350,7 @@ def calibrate_noise(
     from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
+    untold: dict[str, str] = {}
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
@@ -358,12 +359,16 @@ def calibrate_noise(
         folder, field, scene = _load(run)
         known = noise.by_modality(files)
         with _bar("noise", as_json) as show:
-            found = noise.calibrate_noise(field, scene, _names(modalities), known, raw, _views(views), progress=show)
+            found, untold = noise.calibrate_noise(field, scene, _names(modalities), known, raw, _views(views), progress=show)
         destination = out or folder / "sensors"
-    noise.write(found, destination)
-    print(json.dumps({"out": str(destination), "sensors": {n: c.to_json() for n, c in found.items()}}) if as_json else noise_text(found))
-    if not as_json:
-        print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
+    if found:
+        noise.write(found, destination)
+        facts = {"out": str(destination), "sensors": {n: c.to_json() for n, c in found.items()}}
+        print(json.dumps(facts) if as_json else noise_text(found))
+        if not as_json:
+            print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
+    if untold:
+        raise InputError(" ".join(untold.values()))
 
 
 @command("mesh")

@@ -76,20 +76,22 @@ def calibrate_noise(
     raw: Path | None = None,
     views: Sequence[int] | None = None,
     progress: Progress | None = None,
-) -> dict[str, Calibrated]:
+) -> tuple[dict[str, Calibrated], dict[str, str]]:
     """Noise figures of the sensors of a scene, from its frames and the field.
 
     Args:
         modalities: None: all. known: sensor files by modality, whose bits, black level and alignment are believed; without, bits are
             those that the frames use, and black is 0. raw: a folder with other frames of the same poses, ``raw/MODALITY/0009.png``.
         views: of which frames; None: the training views, or all that ``raw`` has. progress: called with (rays done, rays in all).
+    Returns:
+        the figures by modality; and, of modalities whose frames tell nothing (see ``photon_transfer_of_frames``), a sentence that says why.
     Raises:
-        InputError: no frames, or frames that tell nothing (see ``photon_transfer_of_frames``); with the sensor's name.
+        InputError: unknown modality, or no frames of one.
     """
     names = field.check_modalities(None if modalities is None else [canonical_modality(m) for m in modalities])
     chosen = {name: _frames(scene, name, raw, views) for name in names}
     count = Counter(progress, sum(f.camera.width * f.camera.height for frames in chosen.values() for f, _ in frames))
-    out = {}
+    out, untold = {}, {}
     for name, frames in chosen.items():
         sensor = field.sensors[name]
         file = (known or {}).get(name) or _assumed(sensor, frames[0][1])
@@ -97,8 +99,11 @@ def calibrate_noise(
         for frame, path in frames:
             rendered = field.render(frame.camera, field.pose_of(frame), [name], geometry=False, progress=count).channels[name]
             pairs.append((_numbers(path, file), rendered.astype(np.float64) * file.dn_at_one))
-        out[name] = _calibrated(sensor, file, pairs)
-    return out
+        try:
+            out[name] = _calibrated(sensor, file, pairs)
+        except InputError as error:
+            untold[name] = str(error)
+    return out, untold
 
 
 def calibrate_from_frames(file: SensorFile, paths: Sequence[Path]) -> Calibrated:

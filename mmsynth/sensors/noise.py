@@ -53,10 +53,10 @@ class NoiseModel:
         if not 1 <= self.bits <= 16:
             raise InputError(f"noise: bits is {self.bits}, expected 1 to 16.")
         for name in ("gain_dn_e", "full_well_e"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < float("inf"):
                 raise InputError(f"noise: {name} is {getattr(self, name)}, expected a positive number.")
         for name in ("read_e", "black_dn", "dark_e_s", "exposure_s", "row_e", "dsnu_e", "prnu", "crosstalk"):
-            if not getattr(self, name) >= 0:
+            if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"noise: {name} is {getattr(self, name)}, expected a number of at least 0.")
         if self.crosstalk > 0.2:
             raise InputError(f"noise: crosstalk is {self.crosstalk}, expected at most 0.2: a pixel keeps as much as each neighbour gets.")

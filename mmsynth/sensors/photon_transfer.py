@@ -7,11 +7,12 @@ Two ways. ``photon_transfer`` trusts the expectation (a flat field, the truth of
 neighbouring photosites of one channel, and of the expectation only how bright it is there and how much it varies.
 
 Both are maximum likelihood: values v are normal with the variance k σ²(μ) + β a², where k = 1, or 6 for second differences, and a² is
-the expected variation around; or, with a probability that is fitted too, four times as wide (edges and texture that nobody expected).
+the expected variation around; or, with a probability that is fitted too, wider (edges and texture that nobody expected).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -24,8 +25,12 @@ from mmsynth.errors import InputError
 from mmsynth.sensors.mosaic import channel_map
 
 _QUANTISATION = 1.0 / 12.0
-_OUTLIERS = 16.0  # variance of what was not expected, in units of what was
+Wide = tuple[float, float]
+"""Variance of what was not expected: in units of what was, and [DN²]."""
+
+_TEXTURE: Wide = (16.0, 0.0)
 _ACTIVITY = 30.0  # expected square differences up to this many variances count: flatter ones are few where it is bright
+_PLAIN, _LEAST_PLAIN = 10.0, 1000  # there must be as many whose expected square difference is below as many variances
 _MOST = 400_000  # values of a fit
 _LEAST = 200
 _WINDOW, _BLOCK = 3, 32
@@ -106,19 +111,20 @@ def photon_transfer(raw: np.ndarray, expected: np.ndarray, bits: int, black_dn: 
     _check(given)
     theta = _START.copy()
     theta[_SLOPE] = _first_slope(given, 1)
-    free: tuple[int, ...] = (_CONSTANT, _SLOPE, _SQUARE, _UNEXPECTED)
-    for _ in range(4):
-        chosen = _drawn(given[_near(theta, given)], seed)
-        theta = _most_likely(theta, chosen, 1, free)
-    covariance = _sandwich(theta, chosen, 1, free)
+    chosen, free = _drawn(given, seed), (_CONSTANT, _SLOPE, _SQUARE, _UNEXPECTED)
+    wide = _TEXTURE
+    for _ in range(6):
+        wide = _of_outliers(theta, chosen, wide)
+        theta = _most_likely(theta, chosen, 1, free, wide)
+    covariance = _sandwich(theta, chosen, 1, free, wide)
     square, spread = float(np.exp(theta[_SQUARE])), float(np.exp(theta[_SQUARE]) * covariance[_SQUARE, _SQUARE] ** 0.5)
-    if not square > 2.0 * spread:  # the model has no use for it, and the others are told better without
-        theta[_SQUARE] = -np.inf
-        free = (_CONSTANT, _SLOPE, _UNEXPECTED)
-        theta = _most_likely(theta, chosen, 1, free)
-        covariance = _sandwich(theta, chosen, 1, free)
-        return _result(theta, covariance, chosen, 1, black_dn, 0.0, float(np.sqrt(2.0 * spread)))
-    return _result(theta, covariance, chosen, 1, black_dn, square**0.5, 0.5 * spread / square**0.5)
+    if square > 2.0 * spread:
+        return _result(theta, covariance, chosen, 1, black_dn, square**0.5, 0.5 * spread / square**0.5)
+    # no use for it: the others are told better without
+    theta[_SQUARE] = -np.inf
+    theta = _most_likely(theta, chosen, 1, (_CONSTANT, _SLOPE, _UNEXPECTED), wide)
+    covariance = _sandwich(theta, chosen, 1, (_CONSTANT, _SLOPE, _UNEXPECTED), wide)
+    return _result(theta, covariance, chosen, 1, black_dn, 0.0, float(np.sqrt(2.0 * spread)))
 
 
 def photon_transfer_of_frames(
@@ -129,7 +135,9 @@ def photon_transfer_of_frames(
     The values are second differences a - 2 b + c of photosites one tile of the mosaic apart, along rows and columns. PRNU is what
     differences at one place have in common in several frames, E[d_i d_j] = 6 PRNU² μ_i μ_j, where that is more than twice its deviation.
     Standard deviations are by blocks of 32 x 32 photosites (sandwich estimator): differences share photosites, and what is wrong in one
-    place is wrong around it.
+    place is wrong around it; to which comes what plainer surfaces say differently. Fine texture that the model does not see still counts
+    as noise: where all that is bright has it, the gain is too large, by up to a sixth, and the read noise too small, by up to two fifths,
+    and the deviations do not tell.
 
     Args:
         frames: raw (H, W) and expected (H, W, C), all channels at every pixel, DN, black level included; NaN where unknown.
@@ -139,6 +147,8 @@ def photon_transfer_of_frames(
         InputError: too few differences, no range of light, or no noise that grows with light.
     """
     white = 2.0**bits - 1.0
+    if not frames:
+        raise InputError("photon transfer: no frames, expected at least one.")
     found = [_differences(raw.astype(np.float64), e.astype(np.float64), pattern, white, black_dn, i) for i, (raw, e) in enumerate(frames)]
     joined = _Values(*(np.concatenate([getattr(d, f.name) for d in found]) for f in fields(_Values)))
     joined = joined[joined.mean > 0]
@@ -156,7 +166,15 @@ def photon_transfer_of_frames(
         theta[_SQUARE] = 2.0 * np.log(prnu) if prnu > 0 else -np.inf
         chosen = _drawn(plain, seed)
         theta = _most_likely(theta, chosen, 6, free)
-    return _result(theta, _sandwich(theta, chosen, 6, free), chosen, 6, black_dn, prnu, prnu_sd)
+    plainer = chosen[chosen.activity < _PLAIN * _variance_of(theta, chosen.mean)]
+    if len(plainer.value) < _LEAST_PLAIN:
+        raise InputError(
+            f"photon transfer: {len(plainer.value)} differences on plain surfaces, expected at least {_LEAST_PLAIN}; what these frames "
+            "show is textured everywhere, give others."
+        )
+    # how far it hangs on texture is what plainer surfaces say differently
+    result = _result(theta, _sandwich(theta, chosen, 6, free), chosen, 6, black_dn, prnu, prnu_sd)
+    return _and_off(result, _most_likely(theta, plainer, 6, free))
 
 
 def _differences(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, white: float, black: float, frame: int) -> _Values:
@@ -225,23 +243,31 @@ def _variance_of(theta: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return np.asarray(_QUANTISATION + constant + gain * mean + square * mean**2)
 
 
-def _near(theta: np.ndarray, d: _Values) -> np.ndarray:
-    """Whether a value is within six deviations of what is expected, beyond which it is not noise."""
-    return np.asarray(d.value**2 < 36.0 * _variance_of(theta, d.mean))
+def _of_outliers(theta: np.ndarray, d: _Values, wide: Wide) -> Wide:
+    """How wide values are that are no noise: first by those beyond six deviations, then by how likely each value is one of them."""
+    whole = ~np.isfinite(d.bound)
+    variance = _variance_of(theta, d.mean)
+    if wide == _TEXTURE:
+        far = whole & (d.value**2 > 36.0 * variance)
+        return (1.0, float(np.mean(d.value[far] ** 2))) if far.sum() >= 10 else _TEXTURE
+    unexpected = 1.0 / (1.0 + np.exp(-theta[_UNEXPECTED]))
+    narrow = np.log1p(-unexpected) + _log_density(d, variance)[0]
+    likely = 1.0 / (1.0 + np.exp(np.clip(narrow - np.log(unexpected) - _log_density(d, variance + wide[1])[0], -50.0, 50.0)))
+    return 1.0, float(np.average((d.value**2 - variance)[whole], weights=likely[whole]))
 
 
-def _log_likelihood(theta: np.ndarray, d: _Values, factor: int) -> tuple[np.ndarray, np.ndarray]:
+def _log_likelihood(theta: np.ndarray, d: _Values, factor: int, wide: Wide = _TEXTURE) -> tuple[np.ndarray, np.ndarray]:
     """(N,) and its gradient (N, 5)."""
     constant, gain, square, share = np.exp(theta[:4])
     terms = np.stack([np.full_like(d.mean, factor * constant), factor * gain * d.mean, factor * square * d.mean**2, share * d.activity], 1)
     variance = terms.sum(1) + factor * _QUANTISATION
     unexpected = 1.0 / (1.0 + np.exp(-theta[_UNEXPECTED]))
     log_narrow, narrow_slope = _log_density(d, variance)
-    log_wide, wide_slope = _log_density(d, _OUTLIERS * variance)
-    narrow, wide = np.log1p(-unexpected) + log_narrow, np.log(unexpected) + log_wide
-    both = np.logaddexp(narrow, wide)
-    of_wide = np.exp(wide - both)
-    by_variance = (1.0 - of_wide) * narrow_slope + of_wide * _OUTLIERS * wide_slope
+    log_wide, wide_slope = _log_density(d, wide[0] * variance + wide[1])
+    explained, not_explained = np.log1p(-unexpected) + log_narrow, np.log(unexpected) + log_wide
+    both = np.logaddexp(explained, not_explained)
+    of_wide = np.exp(not_explained - both)
+    by_variance = (1.0 - of_wide) * narrow_slope + of_wide * wide[0] * wide_slope
     return both, np.concatenate([by_variance[:, None] * terms, (of_wide - unexpected)[:, None]], 1)
 
 
@@ -256,14 +282,14 @@ def _log_density(d: _Values, variance: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return density, slope
 
 
-def _most_likely(theta: np.ndarray, d: _Values, factor: int, free: Sequence[int]) -> np.ndarray:
+def _most_likely(theta: np.ndarray, d: _Values, factor: int, free: Sequence[int], wide: Wide = _TEXTURE) -> np.ndarray:
     """From a start; what is not free stays."""
     chosen = list(free)
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         full = theta.copy()
         full[chosen] = x
-        value, gradient = _log_likelihood(full, d, factor)
+        value, gradient = _log_likelihood(full, d, factor, wide)
         return -float(value.mean()), -gradient.mean(0)[chosen]
 
     low, high = _LOW[chosen], _HIGH[chosen]
@@ -275,10 +301,10 @@ def _most_likely(theta: np.ndarray, d: _Values, factor: int, free: Sequence[int]
     return out
 
 
-def _sandwich(theta: np.ndarray, d: _Values, factor: int, free: Sequence[int]) -> np.ndarray:
+def _sandwich(theta: np.ndarray, d: _Values, factor: int, free: Sequence[int], wide: Wide = _TEXTURE) -> np.ndarray:
     """(5, 5) covariance of the estimate, regions of a frame taken as independent."""
     chosen = list(free)
-    scores = _log_likelihood(theta, d, factor)[1][:, chosen]
+    scores = _log_likelihood(theta, d, factor, wide)[1][:, chosen]
     _, index = np.unique(np.stack([d.region, d.frame]), axis=1, return_inverse=True)
     per_block = np.stack([np.bincount(index, weights=s) for s in scores.T], 1)
     inverse = np.linalg.pinv(scores.T @ scores)
@@ -332,6 +358,13 @@ def _result(
         prnu_sd=prnu_sd,
         **_curve(theta, d, factor, black_dn),
     )
+
+
+def _and_off(found: PhotonTransfer, other: np.ndarray) -> PhotonTransfer:
+    """The same figures, deviating by what another estimate says, too."""
+    gain, read = float(np.exp(other[_SLOPE])), float(np.exp(0.5 * other[_CONSTANT] - other[_SLOPE]))
+    read_sd = math.hypot(found.read_sd, found.read_e - read) if found.read_e > 0 else max(found.read_sd, read)
+    return replace(found, gain_sd=math.hypot(found.gain_sd, found.gain_dn_e - gain), read_sd=read_sd)
 
 
 def _spread_at_zero(theta: np.ndarray, d: _Values, factor: int) -> float:

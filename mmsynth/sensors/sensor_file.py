@@ -28,7 +28,7 @@ _Positive = Annotated[float, Field(gt=0)]
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Response(_Strict):
@@ -42,15 +42,17 @@ class Response(_Strict):
     value: tuple[Annotated[float, Field(ge=0)], ...] = ()
     centre_nm: float | None = Field(None, gt=0)
     fwhm_nm: float | None = Field(None, gt=0)
-    peak: float = Field(1.0, gt=0)
+    peak: float | None = Field(None, gt=0, description="of the Gaussian; none: 1")
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Response:
-        table, peak = bool(self.nm or self.value), self.centre_nm is not None or self.fwhm_nm is not None
+        table, peak = bool(self.nm or self.value), not self.centre_nm == self.fwhm_nm == self.peak is None
         if table == peak:
             raise ValueError("expected either 'nm' and 'value', or 'centre_nm' and 'fwhm_nm'")
         if table and (len(self.nm) != len(self.value) or len(self.nm) < 2 or np.any(np.diff(self.nm) <= 0)):
             raise ValueError("'nm' and 'value' must be lists of one length, of at least 2 wavelengths that increase")
+        if table and not any(self.value):
+            raise ValueError("'value' is 0 everywhere, expected a response")
         if peak and (self.centre_nm is None or self.fwhm_nm is None):
             raise ValueError("expected both 'centre_nm' and 'fwhm_nm'")
         return self
@@ -59,7 +61,11 @@ class Response(_Strict):
         """Sensitivity at wavelengths (N,) nm → (N,)."""
         if self.centre_nm is None or self.fwhm_nm is None:
             return np.interp(nm, self.nm, self.value, left=0.0, right=0.0)
-        return np.asarray(self.peak * np.exp(-4.0 * math.log(2.0) * ((nm - self.centre_nm) / self.fwhm_nm) ** 2))
+        return np.asarray((self.peak or 1.0) * np.exp(-4.0 * math.log(2.0) * ((nm - self.centre_nm) / self.fwhm_nm) ** 2))
+
+    def detail_nm(self) -> float:
+        """Width of its narrowest detail: FWHM, or the least distance in the table."""
+        return float(np.diff(self.nm).min()) if self.fwhm_nm is None else self.fwhm_nm
 
     def range_nm(self) -> tuple[float, float]:
         """Where it is not negligible."""
@@ -72,7 +78,7 @@ class Polarizer(_Strict):
     """The analyser over a channel's photosites, see ``polarization.analyser_matrix``."""
 
     angle_deg: float = Field(description="of its transmission axis, from image right towards image up")
-    extinction_ratio: float = Field(math.inf, gt=1)
+    extinction_ratio: float = Field(math.inf, gt=1, allow_inf_nan=True)
     throughput: float = Field(1.0, gt=0, le=1, description="share of unpolarized light that it passes, times two")
 
 
@@ -225,7 +231,8 @@ def load_sensor(path: Path) -> SensorFile:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         said = first["msg"].removeprefix("Value error, ").rstrip(".")
-        raise InputError(f"{path}: {where}: {said}." if where else f"{path}: {said}.") from error
+        # what a part says of itself begins with its name
+        raise InputError(f"{path}: {where}: {said}." if where and not said.startswith(f"{where}: ") else f"{path}: {said}.") from error
 
 
 def sensor_to_toml(sensor: SensorFile, comments: tuple[str, ...] = ()) -> str:
@@ -234,7 +241,7 @@ def sensor_to_toml(sensor: SensorFile, comments: tuple[str, ...] = ()) -> str:
     content["noise"] = {k: v for k, v in content["noise"].items() if v != getattr(NoiseModel, k, None)}
     if sensor.camera is not None:
         content["camera"] = {k: v for k, v in content["camera"].items() if v != ()}
-    return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(content)
+    return "".join(f"# {line}\n" for comment in comments for line in comment.splitlines()) + tomli_w.dumps(content)
 
 
 def save_sensor(sensor: SensorFile, path: Path, comments: tuple[str, ...] = ()) -> None:

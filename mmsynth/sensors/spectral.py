@@ -23,7 +23,7 @@ from mmsynth.sensors.sensor_file import Response
 SMOOTH_NM = 150.0
 MEASURED_ERROR = 0.02
 RESIDUAL_LIMIT = 0.15
-_STEP_NM = 2.0
+_STEP_NM = 2.0  # of the integrals over wavelength, or a quarter of the narrowest detail
 _NEGLIGIBLE = 0.05  # of a response's peak
 
 
@@ -53,13 +53,16 @@ def combine(virtual: Response, measured: Sequence[Response], relative_error: flo
     if not measured:
         raise ValueError("no measured responses")
     ranges = np.array([r.range_nm() for r in (virtual, *measured)])
-    nm = np.arange(max(_STEP_NM, ranges[:, 0].min()), ranges[:, 1].max() + _STEP_NM, _STEP_NM)
+    step = min(_STEP_NM, min(r.detail_nm() for r in (virtual, *measured)) / 4.0)
+    nm = np.arange(max(step, ranges[:, 0].min()), ranges[:, 1].max() + step, step)
     apart = 3.0**0.5 * np.abs(nm[:, None] - nm) / SMOOTH_NM
     prior = (1.0 + apart) * np.exp(-apart)
     r_v, r_m = virtual.at(nm), np.stack([r.at(nm) for r in measured])
     gram = r_m @ prior @ r_m.T
     cross = r_m @ prior @ r_v
-    weights = np.linalg.solve(gram + relative_error**2 * np.diag(np.diag(gram)), cross)
+    power = np.diag(gram)
+    # a response to nothing has weight 0
+    weights = np.linalg.solve(gram + np.diag(np.where(power > 0, relative_error**2 * power, 1.0)), cross)
     signal = float(r_v @ prior @ r_v)
     left = r_v - weights @ r_m
     gain = (float(weights**2 @ np.diag(gram)) / signal) ** 0.5

@@ -59,9 +59,15 @@ def blur(light: Tensor, sigma: float) -> Tensor:
 
 
 def aperture(light: Tensor, supersampling: int) -> Tensor:
-    """(..., sH, sW) → (..., H, W): the mean over each pixel, whose aperture is its whole square."""
+    """(..., sH, sW) → (..., H, W): the mean over each pixel, whose aperture is its whole square.
+
+    Raises:
+        ValueError: light that does not fill whole pixels.
+    """
     if supersampling == 1:
         return light
+    if light.shape[-2] % supersampling or light.shape[-1] % supersampling:
+        raise ValueError(f"light of shape {tuple(light.shape)} does not fill whole pixels of {supersampling} x {supersampling}")
     flat = light.reshape(-1, 1, *light.shape[-2:])
     mean = nn.functional.avg_pool2d(flat, supersampling)
     return mean.reshape(*light.shape[:-2], *mean.shape[-2:])
@@ -149,9 +155,10 @@ class SensorTwin(nn.Module):
         Raises:
             ValueError: light of another size.
         """
-        expected = (self.camera.height, self.camera.width)
-        if tuple(light.shape[-2:]) != expected or light.dim() != (5 if self.analysers else 4):
-            raise ValueError(f"light of shape {tuple(light.shape)}, expected {'(B, C, 3, ' if self.analysers else '(B, C, '}{expected}")
+        channels = light.shape[1] if self.mosaic is None else int(self.mosaic.max()) + 1
+        expected = (*((3,) if self.analysers else ()), self.camera.height, self.camera.width)
+        if light.dim() != 2 + len(expected) or tuple(light.shape[2:]) != expected or light.shape[1] != channels:
+            raise ValueError(f"light of shape {tuple(light.shape)}, expected (B, {channels}, {', '.join(map(str, expected))})")
         light = light * (self.sensor.exposure * self.vignetting.to(light))
         if self.mosaic is not None:
             index = self.channel.to(light.device)

@@ -83,8 +83,8 @@ def test_the_figures_of_a_scenes_sensors_come_back(made: Path, tmp_path: Path) -
     scene = load_scene(made / "scene")
     known = by_modality([load_sensor(made / f"{name}.toml") for name in ("rgb", "ms", "pol", "mono")])
     told: list[tuple[int, int]] = []
-    found = calibrate_noise(field, scene, known=known, progress=lambda done, total: told.append((done, total)))
-    assert list(found) == list(scene.sensors) and told[-1][0] == told[-1][1]
+    found, untold = calibrate_noise(field, scene, known=known, progress=lambda done, total: told.append((done, total)))
+    assert not untold and list(found) == list(scene.sensors) and told[-1][0] == told[-1][1]
     for c in found.values():
         p = c.found
         assert c.frames == 5 and p.gain_dn_e == pytest.approx(0.4, rel=0.1) and abs(p.gain_dn_e - 0.4) < 4 * p.gain_sd
@@ -103,7 +103,7 @@ def test_the_figures_of_a_scenes_sensors_come_back(made: Path, tmp_path: Path) -
 
 def test_without_a_file_bits_are_those_in_use_and_black_is_zero(made: Path) -> None:
     field: Field = WithBlack(sphere())  # type: ignore[assignment]
-    (c,) = calibrate_noise(field, load_scene(made / "scene"), ["mono"]).values()
+    (c,) = calibrate_noise(field, load_scene(made / "scene"), ["mono"])[0].values()
     assert c.file.noise.bits == 12 and c.file.noise.black_dn == 0
     # variance over the mean with the black level taken for light: K is told too small, by what the curve's constant cannot take up
     assert 0.3 < c.found.gain_dn_e < 0.42
@@ -114,8 +114,8 @@ def test_other_frames_of_the_same_poses(made: Path, tmp_path: Path) -> None:
     scene = load_scene(made / "scene")
     known = by_modality([load_sensor(made / "mono.toml")])
     raw = made / "scene" / "modalities"
-    (all_of_them,) = calibrate_noise(field, scene, ["mono"], known, raw).values()
-    (two,) = calibrate_noise(field, scene, ["mono"], known, raw, [1, 2]).values()
+    (all_of_them,) = calibrate_noise(field, scene, ["mono"], known, raw)[0].values()
+    (two,) = calibrate_noise(field, scene, ["mono"], known, raw, [1, 2])[0].values()
     assert all_of_them.frames == 6 and two.frames == 2 and two.found.gain_dn_e == pytest.approx(0.4, rel=0.1)
     with pytest.raises(InputError, match="no frames of mono to calibrate from"):
         calibrate_noise(field, scene, ["mono"], known, tmp_path)
@@ -141,6 +141,23 @@ def test_from_frames_alone(tmp_path: Path) -> None:
             calibrate_from_frames(SensorFile.model_validate(described | {"noise": noise} | wrong), paths)
     with pytest.raises(InputError, match="no frames"):
         calibrate_from_frames(file, [])
+
+
+def test_a_sensor_that_saw_texture_alone_does_not_keep_the_others_back(made: Path) -> None:
+    field: Field = WithBlack(sphere())  # type: ignore[assignment]
+    exact = field.render
+
+    def rough(*args: Any, **how: Any) -> Any:
+        seen = exact(*args, **how)
+        if "rgb" in seen.channels:
+            seen.channels["rgb"] *= 1.0 + 0.3 * np.random.default_rng(0).normal(size=seen.channels["rgb"].shape).astype(np.float32)
+        return seen
+
+    field.render = rough  # type: ignore[method-assign]
+    known = by_modality([load_sensor(made / f"{name}.toml") for name in ("rgb", "mono")])
+    found, untold = calibrate_noise(field, load_scene(made / "scene"), ["rgb", "mono"], known)
+    assert list(found) == ["mono"] and list(untold) == ["rgb"]
+    assert untold["rgb"].startswith("rgb: photon transfer: ")
 
 
 def test_what_is_no_converters_is_refused(made: Path, tmp_path: Path) -> None:
