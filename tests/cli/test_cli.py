@@ -107,12 +107,11 @@ read_e = 5.0
 """
 
 
-def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path) -> None:
-    sensors = [json.loads(run(fitted, "info", "example", "--json").stdout)["sensors"]][0]
+def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path, tmp_path: Path) -> None:
+    sensors = json.loads(run(fitted, "info", "example", "--json").stdout)["sensors"]
     name = next(n for n, s in sensors.items() if s["mosaic"] is None)
     (fitted / "own.toml").write_text(MONO_TOML.replace("nir", name))
-    rgb = MONO_TOML.replace("nir", "rgb").replace("own", "rgb")
-    (fitted / "rgb.toml").write_text(rgb)
+    (fitted / "rgb.toml").write_text(MONO_TOML.replace("nir", "rgb"))
     result = run(fitted, "simulate", "--sensor", "own.toml", "--sensor", "rgb.toml", "--views", "all", "--json")
     assert result.returncode == 0, result.stderr
     out = Path(json.loads(result.stdout)["scene"])
@@ -121,7 +120,7 @@ def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path) -> None:
     assert set(again["sensors"]) == {name, "rgb"} and not again["problems"]
     assert all(again["sensors"][n]["frames"] == sensors[n]["frames"] for n in again["sensors"])
     assert again["sensors"]["rgb"]["bits"] == 12 and again["sensors"]["rgb"]["mosaic"] == sensors["rgb"]["mosaic"]
-    assert run(fitted, "fit", str(out), "--steps", "3", "--run", "again").returncode == 0
+    assert run(tmp_path, "fit", str(fitted / out), "--steps", "3").returncode == 0
     # a trajectory, a packaged virtual camera, DNG
     (fitted / "orbit.json").write_text('{"trajectory": "orbit", "views": 3}')
     small = (data_folder("recipes") / "sensors" / "bayer_rgb.toml").read_text()
@@ -143,21 +142,21 @@ def test_bad_simulations_are_refused(fitted: Path) -> None:
     refused(run(fitted, "simulate", "--sensor", "rgb.toml", "--views", "777"), "777")
 
 
-def test_calibrate_noise(fitted: Path) -> None:
-    result = run(fitted, "calibrate-noise", "--modalities", "rgb", "--out", "sensors")
+def test_calibrate_noise(fitted: Path, tmp_path: Path) -> None:
+    assert run(tmp_path, "fit", "example", "--modalities", "nir", "--steps", "200").returncode == 0
+    result = run(tmp_path, "calibrate-noise", "--out", "sensors")
     assert result.returncode == 0, result.stderr
-    assert "gain [DN/e-]" in result.stdout and "wrote sensors/ (rgb.toml, noise.svg)" in result.stdout
-    assert {p.name for p in (fitted / "sensors").iterdir()} == {"rgb.toml", "noise.svg", "noise.json"}
-    again = run(fitted, "simulate", "--sensor", "sensors/rgb.toml", "--views", "test", "--out", "calibrated", "--json")
+    assert "gain [DN/e-]" in result.stdout and "wrote sensors/ (nir.toml, noise.svg)" in result.stdout
+    assert {p.name for p in (tmp_path / "sensors").iterdir()} == {"nir.toml", "noise.svg", "noise.json"}
+    again = run(tmp_path, "simulate", "--sensor", "sensors/nir.toml", "--views", "test", "--json")
     assert again.returncode == 0, again.stderr
-    frames = sorted(str(p) for p in (data_folder("example_scene") / "modalities" / "rgb").iterdir())[:3]
-    (fitted / "described.toml").write_text(
-        (fitted / "sensors" / "rgb.toml").read_text().replace("[noise]", "mosaic = [[1, 2], [0, 1]]\n[noise]")
-    )
-    alone = run(fitted, "calibrate-noise", "--sensor", "described.toml", *frames, "--json")
-    assert alone.returncode == 0 and json.loads(alone.stdout)["sensors"]["rgb"]["frames"] == 3, alone.stderr
-    refused(run(fitted, "calibrate-noise", *frames), "expected one --sensor")
-    refused(run(fitted, "calibrate-noise", "--raw", "nowhere"), "nowhere", "no frames")
+    # raw frames alone
+    frames = sorted(str(p) for p in (data_folder("example_scene") / "modalities" / "infrared").iterdir())[:3]
+    alone = run(tmp_path, "calibrate-noise", "--sensor", "sensors/nir.toml", *frames, "--json")
+    assert alone.returncode == 0 and json.loads(alone.stdout)["sensors"]["nir"]["frames"] == 3, alone.stderr
+    refused(run(tmp_path, "calibrate-noise", *frames), "expected one --sensor")
+    refused(run(tmp_path, "calibrate-noise", "--raw", "nowhere"), "nowhere", "no frames")
+    refused(run(fitted, "calibrate-noise", "--modalities", "rgb"), "rgb", "photon transfer")
 
 
 def test_mesh(fitted: Path) -> None:
