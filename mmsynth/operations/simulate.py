@@ -3,7 +3,8 @@
 Layout of ``<out>``: an MMS-DATA scene in the preprocessed raw layout, and beside it what made it ::
 
     meta_data.json                    written last; the world is the region's ball, ``worldtogt`` takes it to the field's frame
-    modalities/NAME/0009.png          raw mosaic, in the sensor's bits (or .tiff, or .dng for a Bayer pattern)
+    modalities/NAME/0009.png          raw mosaic in the sensor's bits (or .tiff, or .dng for a Bayer pattern); an instance has the name
+                                      of its modality
     sensors/NAME.toml                 the sensor file
     sidecars/NAME/0009.json           all that made the frame: sensor, seed, camera, pose, field, stages, hash; written last of its frame
 
@@ -119,7 +120,7 @@ def _instance(field: Field, file: SensorFile, path: Path, delta: bool) -> Simula
 
     return Simulated(
         file=file,
-        sensor=dataclasses.replace(captured, name=file.name),
+        sensor=captured,
         camera=file.camera or field.cameras.get(name),
         to_reference=_place(file, field.rig.get(name, np.eye(4))),
         modalities=(name,),
@@ -314,7 +315,11 @@ def simulate(
     Raises:
         InputError: see ``plan_sensor``; no views; two sensors of one name; a format that cannot hold a sensor; the disk refused.
     """
-    planned = _planned(field, sensors, views, format, rig, delta)
+    if rig not in RIGS:
+        raise InputError(f"simulate: rig is {rig!r}, expected one of {', '.join(RIGS)}.")
+    if not views:
+        raise InputError("simulate: no views, expected at least one.")
+    planned = _planned(field, sensors, format, delta)
     requests = []
     for p in planned:
         for camera, pose, name in views:
@@ -340,7 +345,7 @@ def simulate_at_frames(
         chosen: view ids; None: all.
     """
     first = next(iter(scene.sensors))
-    planned = _planned(field, sensors, source_views(field, scene, first, chosen), format, "native", delta)
+    planned = _planned(field, sensors, format, delta)
     requests = []
     for p in planned:
         if p.file.instance_of is not None:
@@ -352,13 +357,9 @@ def simulate_at_frames(
     return _write(field, planned, requests, Path(out), seed, format, progress)
 
 
-def _planned(field: Field, sensors: Sequence[str | Path], views: Sequence[View], format: str, rig: str, delta: bool) -> list[Simulated]:
+def _planned(field: Field, sensors: Sequence[str | Path], format: str, delta: bool) -> list[Simulated]:
     if format not in FORMATS:
         raise InputError(f"simulate: format is {format!r}, expected one of {', '.join(FORMATS)}.")
-    if rig not in RIGS:
-        raise InputError(f"simulate: rig is {rig!r}, expected one of {', '.join(RIGS)}.")
-    if not views:
-        raise InputError("simulate: no views, expected at least one.")
     if not sensors:
         raise InputError("simulate: no sensor, expected at least one file.")
     planned = [plan_sensor(field, find_sensor_file(str(s)), delta) for s in sensors]

@@ -78,6 +78,11 @@ def test_a_simulated_rig_is_a_scene_again(field: Any, tmp_path: Path) -> None:
         np.testing.assert_allclose(frame.camera_to_world, ring_pose(frame.view, 4), atol=1e-12)
 
 
+def test_an_instance_is_called_as_its_modality_whatever_its_file_is_called(field: Any, tmp_path: Path) -> None:
+    out = simulate(field, [write(tmp_path, "basler_7", 'instance_of = "rgb"')], VIEWS, tmp_path / "out")
+    assert list(load_scene(out.parent).sensors) == ["rgb"]
+
+
 def test_a_field_in_no_unit_stays_in_none(field: Any, tmp_path: Path) -> None:
     field.unit = "input unit"
     out = simulate(field, [write(tmp_path, "rgb", 'instance_of = "rgb"')], VIEWS, tmp_path / "out")
