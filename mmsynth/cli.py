@@ -238,6 +238,10 @@ def convert(
     target: Annotated[str, typer.Option("--to", help="modality to synthesise")],
     run: RunOption = None,
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
+    method: Annotated[str, typer.Option(help="auto, field, ratio or guided")] = "auto",
+    as_sensor: Annotated[
+        bool, typer.Option("--as-sensor", help="from the target's own place, through its lens; else on the source's pixels")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="default: RUN/convert/FROM_to_TO")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -250,7 +254,7 @@ def convert(
     chosen = _views(views)
     destination = out or folder / "convert" / f"{a}_to_{b}"
     with _bar(f"{a} to {b}", as_json) as show:
-        written = convert_frames(field, scene, a, b, destination, chosen, progress=show)
+        written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, progress=show)
     _tell(destination, written, as_json)
 
 

@@ -1,4 +1,4 @@
-"""Sensor to sensor: what another sensor of the field would have seen at the pose, and on the pixels, of a given frame."""
+"""Sensor to sensor, as files: what another sensor of the field would have seen at given frames (see ``conversion``)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_json
 from mmsynth.operations import previews
+from mmsynth.operations.conversion import Converted, chosen_method, convert_frame
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.operations.trajectories import View
-from mmsynth.scene.images import write_npz, write_png16
-from mmsynth.scene.scene import Scene, Sensor, canonical_modality
+from mmsynth.scene.images import load_frame, write_npz, write_png16
+from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.mosaic import mosaic
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
@@ -107,68 +110,70 @@ def convert(
     target: str,
     out: Path | str,
     views: Sequence[int] | None = None,
+    method: str = "auto",
+    as_sensor: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Render modality ``target`` at the pose of every ``source`` frame, on its pixel grid (intrinsics and lens included).
-
-    Aligned by construction: no warp and no resampling. See ``convert_views`` for the files.
-
-    Args:
-        views: view ids; None: all frames of the source. progress: called with (rays done, rays in all).
-    Returns:
-        the files written, the sidecars included.
-    Raises:
-        InputError: unknown modality or view, or the disk refused.
-    """
-    # known before anything is rendered or written
-    field.check_modalities([canonical_modality(target)])
-    return convert_views(field, target, source_views(field, scene, source, views), out, progress, source=canonical_modality(source))
-
-
-def convert_views(
-    field: Field, target: str, views: Sequence[View], out: Path | str, progress: Progress | None = None, source: str | None = None
-) -> list[Path]:
-    """Render one modality at any views.
+    """What modality ``target`` would have seen at every ``source`` frame: on the frame's own pixels (intrinsics and lens included), aligned
+    by construction, or as the target sensor itself would have seen it, from its place on the rig.
 
     Per view, in ``<out>/<target>/``:
 
-    * ``NAME.npz``: data (H, W, C) float32, opacity, valid, channels, wavelengths_nm; polarization also stokes (H, W, 3) in this
-      camera's x-axis frame;
+    * ``NAME.npz``: data (H, W, C) float32, opacity, valid, confidence, guided, channels, wavelengths_nm; polarization also stokes (H, W, 3)
+      in this camera's x-axis frame; with ``as_sensor`` and a mosaic also raw (H, W), what its photosites measure;
     * ``NAME.png``: 16-bit preview, tone-mapped with one exposure for all views; for polarization S0, and ``NAME_dolp.png`` (grey)
-      and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``);
-    * ``NAME.json``: camera, conventions, hash; written last, so a view with a sidecar is complete.
+      and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``); ``NAME_confidence.png``;
+    * ``NAME.json``: camera, method, exposure, conventions, hash; written last, so a view with a sidecar is complete.
+
+    Args:
+        views: view ids; None: all frames of the source. method: see ``conversion``. progress: called with (rays done, rays in all).
+    Returns:
+        the files written, the sidecars included.
+    Raises:
+        InputError: unknown modality, view or method, an unreadable frame, a target without a place on the rig, or the disk refused.
     """
-    target = canonical_modality(target)
+    source, target = canonical_modality(source), canonical_modality(target)
+    # known before anything is rendered or written
     field.check_modalities([target])
-    if not views:
+    chosen = source_views(field, scene, source, views)
+    field.check_modalities([source])
+    if not chosen:
         raise InputError(f"convert to {target}: no views, expected at least one frame.")
     sensor, folder = field.sensors[target], Path(out) / target
-    count = Counter(progress, sum(camera.width * camera.height for camera, _, _ in views))
+    used = chosen_method(method, field.sensors[source], sensor)
+    frames = [f for f in scene.frames_of(source) if views is None or f.view in set(views)]
+    places = [_place(field, scene, source, target, frame) if as_sensor else None for frame in frames]
+    rays = [c.width * c.height + (0 if p is None else p[0].width * p[0].height) for (c, _, _), p in zip(chosen, places, strict=True)]
+    count = Counter(progress, sum(rays))
     written: list[Path] = []
     exposure: float | None = None
-    for camera, pose, name in views:
-        before = count.done
-        rendering = field.render(camera, pose, [target], geometry=False, progress=count)
-        count(before + camera.width * camera.height - count.done)
+    for frame, (camera, pose, name), place, cost in zip(frames, chosen, places, rays, strict=True):
+        goal = count.done + cost
+        pixels, _ = load_frame(scene.sensors[source], frame)
+        found = convert_frame(field, pixels, camera, pose, source, target, used, place, progress=count)
+        count(goal - count.done)
         sidecar = folder / f"{name}.json"
         # a stale sidecar must not vouch for new files if this run is cut off
         sidecar.unlink(missing_ok=True)
         data = folder / f"{name}.npz"
-        write_npz(data, {**modality_arrays(sensor, rendering), "opacity": rendering.opacity, "valid": rendering.valid})
-        linear = previews.preview_linear(sensor, rendering.channels[target])
+        write_npz(data, _arrays(sensor, found, as_sensor))
+        linear = previews.preview_linear(sensor, found.values)
         exposure = previews.exposure_of(linear) if exposure is None else exposure
-        pictures = {folder / f"{name}.png": previews.tone_map(linear, exposure)}
-        if sensor.is_polarization:
-            pictures[folder / f"{name}_dolp.png"] = previews.preview_dolp(rendering.stokes[target])
-            pictures[folder / f"{name}_aolp.png"] = previews.preview_aolp(rendering.stokes[target])
+        pictures = {folder / f"{name}.png": previews.tone_map(linear, exposure), folder / f"{name}_confidence.png": found.confidence}
+        if found.stokes is not None:
+            pictures[folder / f"{name}_dolp.png"] = previews.preview_dolp(found.stokes)
+            pictures[folder / f"{name}_aolp.png"] = previews.preview_aolp(found.stokes)
         for path, picture in pictures.items():
             write_png16(path, picture)
         facts = {
             "name": name,
             "modality": target,
             "from": source,
+            "method": found.method,
+            "frame_exposure": found.exposure,
+            "guided": float(found.guided.mean()),
             "sensor": sensor_json(sensor),
-            "camera": camera_json(camera, pose),
+            "camera": camera_json(*(place or (camera, pose))),
             "conventions": CONVENTIONS,
             "unit": field.unit,
             "preview_exposure": exposure,
@@ -177,6 +182,34 @@ def convert_views(
         write_json(sidecar, facts)
         written += [data, *pictures, sidecar]
     return written
+
+
+def _place(field: Field, scene: Scene, source: str, target: str, frame: Frame) -> tuple[Camera, np.ndarray]:
+    """Camera and pose of the target sensor at a frame of the source: its own frame of that view, else its place on the rig."""
+    own = [f for f in scene.frames_of(target) if f.view == frame.view] if target in scene.sensors else []
+    if own:
+        return own[0].camera, field.pose_of(own[0])
+    if target not in field.cameras or source not in field.rig or target not in field.rig:
+        raise InputError(f"convert: {target!r} has no known place on the rig of {source!r}, expected a frame of it in view {frame.view}.")
+    return field.cameras[target], field.pose_of(frame) @ np.linalg.inv(field.rig[source]) @ field.rig[target]
+
+
+def _arrays(sensor: Sensor, found: Converted, as_sensor: bool) -> dict[str, np.ndarray]:
+    arrays = {
+        "data": found.values,
+        "channels": np.array(sensor.channels, dtype=np.str_),
+        "wavelengths_nm": wavelengths_array(sensor),
+        "opacity": found.opacity,
+        "valid": found.valid,
+        "confidence": found.confidence,
+        "guided": found.guided,
+    }
+    if found.stokes is not None:
+        arrays["stokes"] = found.stokes
+        arrays["polarizer_angles_deg"] = np.array(sensor.polarizer_angles_deg, np.float32)
+    if as_sensor and sensor.mosaic is not None:
+        arrays["raw"] = mosaic(torch.from_numpy(found.values).movedim(-1, 0), sensor.mosaic).numpy()
+    return arrays
 
 
 CONVENTIONS = {

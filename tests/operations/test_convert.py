@@ -21,8 +21,8 @@ def test_convert_to_multispectral(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=3, truth=False)
     calls: list[tuple[int, int]] = []
-    written = convert(field, scene, "rgb", "multispectral", tmp_path / "out", progress=lambda *c: calls.append(c))  # type: ignore[arg-type]
-    assert sorted(p.name for p in written) == [f"{v:04d}.{s}" for v in range(3) for s in ("json", "npz", "png")]
+    written = convert(field, scene, "rgb", "multispectral", tmp_path / "out", method="field", progress=lambda *c: calls.append(c))  # type: ignore[arg-type]
+    assert sorted(p.name for p in written) == [f"{v:04d}{s}" for v in range(3) for s in (".json", ".npz", ".png", "_confidence.png")]
     assert all(p.parent == tmp_path / "out" / "ms" and p.is_file() for p in written)
     frame = scene.frames_of("rgb")[1]
     with np.load(tmp_path / "out/ms/0001.npz") as arrays:
@@ -44,7 +44,7 @@ def test_convert_to_polarization(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
     written = convert(field, scene, "multispectral", "pol", tmp_path / "out", views=[1])  # type: ignore[arg-type]
-    assert sorted(p.name for p in written) == ["0001.json", "0001.npz", "0001.png", "0001_aolp.png", "0001_dolp.png"]
+    assert sorted(p.name for p in written) == ["0001.json", "0001.npz", "0001.png", "0001_aolp.png", "0001_confidence.png", "0001_dolp.png"]
     with np.load(tmp_path / "out/pol/0001.npz") as arrays:
         assert np.allclose(stokes_to_intensities(torch.from_numpy(arrays["stokes"]), (0, 45, 90, 135)), arrays["data"], atol=1e-6)
         seen = arrays["opacity"] > 0.5

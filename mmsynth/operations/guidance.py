@@ -1,0 +1,148 @@
+"""What an actual frame knows that the field does not: a gain at every pixel, and a rest of colour.
+
+The frame and the field's rendering of it are compared photosite by photosite, never demosaicked:
+
+* ``exposure``: the one factor between them, which belongs to the frame and not to the scene.
+* ``gain`` g(x): the least squares factor of the rendering in a small window, weighted by the noise of each photosite, with the prior
+  g = 1 ± τ. τ is how far frame and rendering differ beyond noise (empirical Bayes): a field that is right already is left alone.
+* ``rest``: what of the frame g times the rendering does not explain, per channel, smoothed and shrunk by how much of it is noise.
+
+Edges that the field has out of place, shading and sharpness it has missed are the same in all modalities: another one is multiplied by
+g (``ratio``). The rest goes into another modality by a local linear map between the two, learned from the field's own renderings and
+shrunk to the whole picture's (``guided``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter, uniform_filter
+
+from mmsynth.scene.scene import Sensor
+from mmsynth.sensors.mosaic import channel_map, demosaic
+
+# of a photosite whose sensor nobody calibrated: shot noise of 10,000 electrons at full scale, and a floor
+SHOT, FLOOR = 1e-4, 1e-6
+_WINDOW = 0.5  # px, standard deviation: a photosite and its direct neighbours
+_REST_WINDOW = 1.5
+_MAP_RADIUS, _MAP_RIDGE = 4, 1e-3
+_STRANGE = 0.35  # relative rest, or a gain beyond (1 + _STRANGE)^±3, that nothing in the field explains
+
+
+@dataclass(frozen=True)
+class Guide:
+    """A frame against its rendering (H, W).
+
+    Attributes:
+        exposure: factor of the whole frame. gain: (H, W), 1 = as rendered. gain_sd: its posterior standard deviation.
+        rest: (H, W, C), in the field's exposure. prior_sd: τ. strange: (H, W) bool, where the frame shows what the field does not have.
+    """
+
+    exposure: float
+    gain: np.ndarray
+    gain_sd: np.ndarray
+    rest: np.ndarray
+    prior_sd: float
+    strange: np.ndarray
+
+
+def guide(raw: np.ndarray, rendered: np.ndarray, sensor: Sensor, valid: np.ndarray) -> Guide:
+    """Compare a frame with the field's rendering of it.
+
+    Args:
+        raw: (H, W) of a mosaic, else (H, W, C), linear. rendered: (H, W, C). valid: (H, W) bool, where the lens has a ray.
+    """
+    height, width = rendered.shape[:2]
+    clear = np.where(valid[..., None], rendered, 0.0).astype(np.float64)
+    if sensor.mosaic is None:
+        seen, expected, used = raw.astype(np.float64), clear, np.broadcast_to(valid[..., None], clear.shape)
+    else:
+        index = channel_map(sensor.mosaic, height, width)[..., None]
+        seen, expected, used = raw[..., None].astype(np.float64), np.take_along_axis(clear, index, -1), valid[..., None]
+    # a clipped value says "at least": nothing where the rendering says as much
+    used = used & (seen < sensor.saturation)
+    variance = SHOT * np.maximum(expected, 0.0) + FLOOR
+    weight = np.where(used, 1.0 / variance, 0.0)
+    exposure = _exposure(seen, expected, weight)
+    expected, variance = exposure * expected, exposure**2 * variance
+    weight = weight / exposure**2
+    # τ² from what is left beyond noise, robust against things that are not in the field
+    difference = np.where(used, seen - expected, 0.0)
+    prior = _prior(difference, expected, variance, used)
+    window = lambda x: gaussian_filter(x, _WINDOW, mode="nearest") / _centre(_WINDOW)
+    power, product = window((weight * expected**2).sum(-1)), window((weight * seen * expected).sum(-1))
+    precision = power + 1.0 / prior**2
+    gain = (product + 1.0 / prior**2) / precision
+    left = difference - (gain[..., None] - 1.0) * expected
+    rest, strange = _rest(left, expected, variance, used, sensor, gain)
+    return Guide(exposure, np.where(valid, gain, 1.0), precision**-0.5, rest / exposure, prior, strange & valid)
+
+
+def _centre(sigma: float) -> float:
+    """What a single value keeps under the filter: sums over the window, in units of it."""
+    impulse = np.zeros((9, 9))
+    impulse[4, 4] = 1.0
+    return float(gaussian_filter(impulse, sigma)[4, 4])
+
+
+def _exposure(seen: np.ndarray, expected: np.ndarray, weight: np.ndarray) -> float:
+    """Median over photosites of the ratio, brighter ones counting more; 1 where there is nothing to compare."""
+    good = (weight > 0) & (expected > 0.01)
+    if good.sum() < 16:
+        return 1.0
+    ratio, w = seen[good] / expected[good], expected[good]
+    order = np.argsort(ratio)
+    return float(max(ratio[order][np.searchsorted(np.cumsum(w[order]), 0.5 * w.sum())], 1e-6))
+
+
+def _prior(difference: np.ndarray, expected: np.ndarray, variance: np.ndarray, used: np.ndarray) -> float:
+    """τ: of (seen - expected) / expected beyond noise; 98 % of the pixels, the others may be something new."""
+    square, noise, power = difference[used] ** 2, variance[used], expected[used] ** 2
+    if len(square) < 16 or not power.sum() > 0:
+        return 1e-3
+    near = square <= np.quantile(square, 0.98)
+    return float(np.sqrt(np.clip((square[near] - noise[near]).sum() / power[near].sum(), 1e-6, 0.25)))
+
+
+def _rest(
+    left: np.ndarray, expected: np.ndarray, variance: np.ndarray, used: np.ndarray, sensor: Sensor, gain: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rest of colour at every pixel (H, W, C), and where it is too large to be an error of the field."""
+    if sensor.mosaic is None:
+        full, noise = np.where(used, left, 0.0), variance
+    else:
+        full = np.moveaxis(demosaic(torch.from_numpy(np.where(used, left, 0.0)[..., 0]), sensor.mosaic).numpy(), 0, -1)
+        noise = np.broadcast_to(variance, full.shape)
+    smooth = lambda x: gaussian_filter(x, (_REST_WINDOW, _REST_WINDOW, 0), mode="nearest")
+    low = smooth(full)
+    # of independent values a window of σ leaves 1 / (4 π σ²) of the variance; a mosaic has fewer of each channel
+    tile = 1 if sensor.mosaic is None else sensor.mosaic.size
+    noise_left = smooth(noise) * min(1.0, tile / (4.0 * np.pi * _REST_WINDOW**2))
+    power = uniform_filter(low**2, (9, 9, 0), mode="nearest")
+    rest = low * np.clip(1.0 - noise_left / np.maximum(power, 1e-12), 0.0, 1.0)
+    if full.shape[-1] == 1:
+        rest = np.zeros_like(rest)  # one channel has no colour
+    level = smooth(np.maximum(expected, 0.0).mean(-1, keepdims=True))[..., 0] + 0.02
+    far = np.abs(np.log(np.clip(gain, 1e-3, 1e3))) > 3.0 * np.log1p(_STRANGE)
+    return rest, far | (np.abs(low).max(-1) > _STRANGE * level)
+
+
+def linear_map(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """(H, W, K, C): how the target's channels vary with the source's around each pixel, in the field's own renderings.
+
+    Ridge regression in windows of 9 x 9 pixels, shrunk to the map of the whole picture where a window is plain.
+
+    Args:
+        source: (H, W, C). target: (H, W, K).
+    """
+    x, y = (np.where(valid[..., None], a, 0.0).astype(np.float64) for a in (source, target))
+    flat_x, flat_y = x[valid], y[valid]
+    ridge = _MAP_RIDGE * np.eye(x.shape[-1])
+    whole = np.linalg.solve(flat_x.T @ flat_x + ridge * len(flat_x), flat_x.T @ flat_y).T
+    mean = lambda a: uniform_filter(a, (2 * _MAP_RADIUS + 1,) * 2 + (0,) * (a.ndim - 2), mode="nearest")
+    mx, my = mean(x), mean(y)
+    of_x = mean(x[..., :, None] * x[..., None, :]) - mx[..., :, None] * mx[..., None, :]
+    of_both = mean(y[..., :, None] * x[..., None, :]) - my[..., :, None] * mx[..., None, :]
+    return np.linalg.solve(of_x + ridge, np.swapaxes(of_both + _MAP_RIDGE * whole, -1, -2)).swapaxes(-1, -2)
