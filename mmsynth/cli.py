@@ -80,6 +80,17 @@ def _frames(text: str | None) -> dict[str, int]:
     return limits
 
 
+def _pairs(text: str, known: list[str]) -> list[tuple[str, str]]:
+    from mmsynth.scene.scene import canonical_modality
+
+    if text == "all":
+        return [(a, b) for a in known for b in known if a != b]
+    if not re.fullmatch(r"[^:,\s]+:[^:,\s]+(,[^:,\s]+:[^:,\s]+)*", text):
+        raise InputError(f"--convert {text!r}: expected pairs such as rgb:ms or rgb:ms,mono:pol, or all.")
+    pairs = [part.split(":") for part in text.split(",")]
+    return [(canonical_modality(a), canonical_modality(b)) for a, b in pairs]
+
+
 def _seeds(text: str) -> list[int]:
     if not re.fullmatch(r"\d+(,\d+)*", text):
         raise InputError(f"--seeds {text!r}: expected numbers such as 0,1.")
@@ -219,13 +230,30 @@ def fit(
 
 
 @command("evaluate")
-def evaluate(run: RunOption = None, as_json: JsonOption = False) -> None:
+def evaluate(
+    run: RunOption = None,
+    convert: Annotated[
+        str | None, typer.Option(help="score conversions instead, e.g. rgb:ms or rgb:ms,mono:pol; all: every pair", metavar="FROM:TO")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
     """Score the test views."""
     from mmsynth.operations.evaluate import evaluate as score
     from mmsynth.report.report import write_report
-    from mmsynth.report.text import score_text
+    from mmsynth.report.text import conversion_text, score_text
 
     folder, field, scene = _load(run)
+    if convert is not None:
+        from mmsynth.operations.evaluate_conversion import evaluate_conversion
+
+        pairs = _pairs(convert, list(field.sensors))
+        found = []
+        with _bar("evaluate", as_json) as show:
+            for done, (a, b) in enumerate(pairs):
+                found.append(evaluate_conversion(field, scene, a, b))
+                show(done + 1, len(pairs))
+        print(json.dumps({"conversions": found}) if as_json else conversion_text(found))
+        return
     with _bar("evaluate", as_json) as show:
         scores = score(field, scene, progress=show)
     write_report(folder, field, scores, scene=scene)

@@ -3,8 +3,8 @@
 Three methods:
 
 * ``field``: the field's rendering alone.
-* ``ratio``: times the local gain between the frame and the field's rendering of it (``guidance``). Of polarization all Stokes components
-  alike: DoLP and AoLP stay the field's.
+* ``ratio``: times the local gain between the frame and the field's rendering of it, as far as the target varies with the source
+  (``guidance``). Of polarization all Stokes components alike: DoLP and AoLP stay the field's.
 * ``guided``: the ratio, and what colour the frame has beyond it, through a local linear map learned from the field's own renderings.
 
 ``auto`` is guided where both have colours, else the ratio: measured on scenes with ground truth, neither is worse than the field, because
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.operations.guidance import Guide, guide, linear_map
+from mmsynth.operations.guidance import Guide, contrast, guide, linear_map
 from mmsynth.scene.scene import Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera, project, ray_map
 
@@ -98,10 +98,13 @@ def convert_frame(
     elsewhere = seen_by is not None
     seen = field.render(camera, pose, list(dict.fromkeys((source, target))), geometry=elsewhere, progress=progress)
     hint = guide(raw, seen.channels[source], sensor, seen.valid)
-    gain, more = np.ones(seen.valid.shape), np.zeros((*seen.valid.shape, field.sensors[target].channel_count))
+    of_light = field.sensors[target].is_polarization  # one gain for all of a Stokes vector
+    gain = np.ones((*seen.valid.shape, 1 if of_light else field.sensors[target].channel_count))
+    more = np.zeros((*seen.valid.shape, field.sensors[target].channel_count))
     if used != "field":
-        gain = hint.gain
-    if used == "guided" and not field.sensors[target].is_polarization:
+        shown = seen.channels[target].mean(-1, keepdims=True) if of_light else seen.channels[target]
+        gain = np.maximum(hint.gain, 1e-3)[..., None] ** contrast(seen.channels[source], shown, seen.valid)
+    if used == "guided" and not of_light:
         more = (linear_map(seen.channels[source], seen.channels[target], seen.valid) @ hint.rest[..., None])[..., 0]
     if seen_by is None:
         maps = gain, more, hint.gain_sd
@@ -110,7 +113,7 @@ def convert_frame(
     layers = np.dstack([gain, more, hint.gain_sd, seen.valid, hint.strange])
     carried, visible = _carried(layers, seen, (camera, pose), there, seen_by)
     strange = visible & (carried[..., -1] > 0.5)
-    maps = carried[..., 0], carried[..., 1:-3], carried[..., -3]
+    maps = carried[..., : gain.shape[-1]], carried[..., gain.shape[-1] : -3], carried[..., -3]
     return _put_together(field, target, used, there, maps, visible & (carried[..., -2] > 0.99) & ~strange, strange, hint)
 
 
@@ -125,9 +128,9 @@ def _put_together(
     hint: Guide,
 ) -> Converted:
     """``told``: where the frame has a say. ``strange``: where it shows what the field does not have."""
-    gain, more = np.where(told, maps[0], 1.0), np.where(told[..., None], maps[1], 0.0)
-    values = np.maximum(seen.channels[target] * gain[..., None] + more, 0.0)  # NaN stays
-    stokes = seen.stokes[target] * gain[..., None] if field.sensors[target].is_polarization else None
+    gain, more = np.where(told[..., None], maps[0], 1.0), np.where(told[..., None], maps[1], 0.0)
+    values = np.maximum(seen.channels[target] * gain + more, 0.0)  # NaN stays
+    stokes = seen.stokes[target] * gain if field.sensors[target].is_polarization else None
     # where the frame says nothing the field is as sure as it proved to be elsewhere
     deviation = np.where(told, maps[2], hint.prior_sd)
     sure = np.exp(-0.5 * (deviation / _SURE) ** 2)
@@ -141,6 +144,15 @@ def _put_together(
         opacity=seen.opacity,
         valid=seen.valid,
     )
+
+
+def carried_through(
+    field: Field, values: np.ndarray, frame: tuple[Camera, np.ndarray], seen_by: tuple[Camera, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values (H, W, M) of one camera's pixels → on another's, through the field's surface; and where it sees the same surface."""
+    some = next(iter(field.sensors))
+    seen, there = field.render(*frame, [some]), field.render(*seen_by, [some])
+    return _carried(np.where(seen.valid[..., None], values, 0.0), seen, frame, there, seen_by)
 
 
 def _carried(

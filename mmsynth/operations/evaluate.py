@@ -135,7 +135,7 @@ def spectral_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-class _Truth:
+class GroundTruth:
     """The scene's ``gt`` folder; every method gives None where it has nothing."""
 
     def __init__(self, scene: Scene) -> None:
@@ -270,7 +270,7 @@ def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, pro
     if not frames or (views is not None and missing):
         what = f"view {missing[0]}" if missing else "test views"
         raise InputError(f"{scene.root}: no frames of {what} for any of {', '.join(field.sensors)}, expected view ids of the scene.")
-    truth = _Truth(scene)
+    truth = GroundTruth(scene)
     # the pose of gt/aligned and gt/geometry; their lengths are metres
     at_rgb = [frame for frame in scene.frames_of("rgb", chosen) if truth.aligned(frame.view) or truth.geometry(frame.view)]
     count = Counter(progress, sum(frame.camera.width * frame.camera.height for frame in (*frames, *at_rgb)))

@@ -7,9 +7,10 @@ The frame and the field's rendering of it are compared photosite by photosite, n
   g = 1 ± τ. τ is how far frame and rendering differ beyond noise (empirical Bayes): a field that is right already is left alone.
 * ``rest``: what of the frame g times the rendering does not explain, per channel, smoothed and shrunk by how much of it is noise.
 
-Edges that the field has out of place, shading and sharpness it has missed are the same in all modalities: another one is multiplied by
-g (``ratio``). The rest goes into another modality by a local linear map between the two, learned from the field's own renderings and
-shrunk to the whole picture's (``guided``).
+Edges that the field has out of place, shading and sharpness it has missed are the same in all modalities: another one is multiplied by g
+(``ratio``), or by g^β where it varies less than the source does: paint that infrared does not see has β = 0 (``contrast``, learned from
+the field's own renderings). The rest goes into another modality by a local linear map between the two, learned from the same renderings
+and shrunk to the whole picture's (``guided``).
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ SHOT, FLOOR = 1e-4, 1e-6
 _WINDOW = 0.5  # px, standard deviation: a photosite and its direct neighbours
 _REST_WINDOW = 1.5
 _MAP_RADIUS, _MAP_RIDGE = 4, 1e-3
+_PLAIN = 0.005  # variance of logarithms below which a window is plain
+_DARK = 0.02
 _STRANGE = 0.35  # relative rest, or a gain beyond (1 + _STRANGE)^±3, that nothing in the field explains
 
 
@@ -127,6 +130,20 @@ def _rest(
     level = smooth(np.maximum(expected, 0.0).mean(-1, keepdims=True))[..., 0] + 0.02
     far = np.abs(np.log(np.clip(gain, 1e-3, 1e3))) > 3.0 * np.log1p(_STRANGE)
     return rest, far | (np.abs(low).max(-1) > _STRANGE * level)
+
+
+def contrast(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """β(x), (H, W, K) in [0, 1]: by how much the logarithm of each target channel varies with that of the source's mean, around each
+    pixel, in the field's own renderings; 1 where nothing varies, and light is what could.
+
+    Args:
+        source: (H, W, C). target: (H, W, K).
+    """
+    log = lambda a: np.log(np.maximum(np.where(valid[..., None], a, 0.0), 0.0).astype(np.float64) + _DARK)
+    x, y = log(source.mean(-1, keepdims=True)), log(target)
+    mean = lambda a: uniform_filter(a, (2 * _MAP_RADIUS + 1, 2 * _MAP_RADIUS + 1, 0), mode="nearest")
+    mx, my = mean(x), mean(y)
+    return np.asarray(np.clip((mean(x * y) - mx * my + _PLAIN) / (mean(x * x) - mx * mx + _PLAIN), 0.0, 1.0))
 
 
 def linear_map(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -32,6 +32,23 @@ def score_text(scores: Mapping[str, Any]) -> str:
     lines += [f"{key}: {value:.5g}" for key, value in scores.get("geometry", {}).items() if isinstance(value, float)]
     seconds = ", ".join(f"{k} {v:.1f}" for k, v in scores.get("seconds", {}).items() if isinstance(v, (int, float)))
     lines.append(f"seconds: {seconds}; {scores.get('rays_per_s', 0):,.0f} rays/s")
+    return "\n".join(lines)
+
+
+def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
+    """The result of ``evaluate --convert``: per pair a row for each method and baseline; "auto" marks the one that it stands for."""
+    columns = {
+        "psnr": "psnr [dB]", "psnr_region": "region", "ssim": "ssim", "sam": "sam [deg]", "ergas": "ergas", "stokes_rmse": "stokes rmse",
+        "dolp_rmse": "dolp rmse", "aolp_mae": "aolp [deg]",
+    }  # fmt: skip
+    keys = [k for k in columns if any(k in m for pair in found for m in pair["methods"].values())]
+    lines = ["".join([f"{'':28s}"] + [f"{columns[k]:>12s}" for k in keys])]
+    for pair in found:
+        views = f"{len(pair['views'])} frames, truth: {pair['truth']}, {pair['seconds_per_frame']:.2f} s a frame"
+        lines.append(f"{pair['source']} to {pair['target']} ({views})")
+        for name, m in pair["methods"].items():
+            label = f"  {name}{' (auto)' if name == pair['auto'] else ''}"
+            lines.append("".join([f"{label:28s}"] + [f"{m[k]:12.3f}" if k in m else f"{'':12s}" for k in keys]))
     return "\n".join(lines)
 
 
