@@ -267,6 +267,9 @@ def convert(
     run: RunOption = None,
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
     method: Annotated[str, typer.Option(help="auto, field, ratio or guided")] = "auto",
+    images: Annotated[
+        list[Path] | None, typer.Option(help="frames of the source without a pose, once per file: found by what they show")
+    ] = None,
     as_sensor: Annotated[
         bool, typer.Option("--as-sensor", help="from the target's own place, through its lens; else on the source's pixels")
     ] = False,
@@ -275,6 +278,7 @@ def convert(
 ) -> None:
     """Another modality at the poses of the frames of one."""
     from mmsynth.operations.convert import convert as convert_frames
+    from mmsynth.operations.convert import convert_images
     from mmsynth.scene.scene import canonical_modality
 
     folder, field, scene = _load(run)
@@ -282,7 +286,12 @@ def convert(
     chosen = _views(views)
     destination = out or folder / "convert" / f"{a}_to_{b}"
     with _bar(f"{a} to {b}", as_json) as show:
-        written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, progress=show)
+        if images:
+            if views is not None or as_sensor:
+                raise InputError("--images: their own pixels are converted, expected neither --views nor --as-sensor.")
+            written = convert_images(field, scene, a, b, images, destination, method, progress=show)
+        else:
+            written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, progress=show)
     _tell(destination, written, as_json)
 
 

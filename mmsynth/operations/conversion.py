@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 METHODS = ("auto", "field", "ratio", "guided")
 _SAME_SURFACE = 0.02  # of the distance: how far a point may lie behind what the source sees there
+_CARRIED = 0.6  # of a correction is right where it arrives through the surface: measured, on two scenes with ground truth
 _SURE = 0.1  # relative deviation at which confidence has fallen to exp(-1/2)
 
 
@@ -110,6 +111,7 @@ def convert_frame(
         maps = gain, more, hint.gain_sd
         return _put_together(field, target, used, seen, maps, seen.valid & ~hint.strange, hint.strange, hint)
     there = field.render(*seen_by, [target], geometry=True, progress=progress)
+    gain, more = gain**_CARRIED, more * _CARRIED
     layers = np.dstack([gain, more, hint.gain_sd, seen.valid, hint.strange])
     carried, visible = _carried(layers, seen, (camera, pose), there, seen_by)
     strange = visible & (carried[..., -1] > 0.5)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,7 @@ from mmsynth.files import write_json
 from mmsynth.operations import previews
 from mmsynth.operations.conversion import Converted, chosen_method, convert_frame
 from mmsynth.operations.progress import Counter, Progress
+from mmsynth.operations.register import landmarks, register
 from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import load_frame, write_npz, write_png16
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
@@ -139,41 +142,107 @@ def convert(
     field.check_modalities([source])
     if not chosen:
         raise InputError(f"convert to {target}: no views, expected at least one frame.")
-    sensor, folder = field.sensors[target], Path(out) / target
-    used = chosen_method(method, field.sensors[source], sensor)
     frames = [f for f in scene.frames_of(source) if views is None or f.view in set(views)]
     places = [_place(field, scene, source, target, frame) if as_sensor else None for frame in frames]
-    rays = [c.width * c.height + (0 if p is None else p[0].width * p[0].height) for (c, _, _), p in zip(chosen, places, strict=True)]
+    items = [
+        _Item(frame.path.name, name, camera, pose, place, functools.partial(_pixels, scene.sensors[source], frame), {})
+        for frame, (camera, pose, name), place in zip(frames, chosen, places, strict=True)
+    ]
+    return _convert_each(field, source, target, items, Path(out), method, progress)
+
+
+def convert_images(
+    field: Field,
+    scene: Scene,
+    source: str,
+    target: str,
+    images: Sequence[Path],
+    out: Path | str,
+    method: str = "auto",
+    progress: Progress | None = None,
+) -> list[Path]:
+    """``convert`` of frames without a pose, on their own pixels: each is registered against the field first (see ``register``).
+
+    Args:
+        images: files of the source sensor, with its size, lens and mosaic. Their names become those of the results.
+    Raises:
+        InputError: as ``convert``; a file of another size; a frame that cannot be registered, and why. Nothing is written then.
+    """
+    source, target = canonical_modality(source), canonical_modality(target)
+    field.check_modalities([source, target])
+    if not images:
+        raise InputError(f"convert to {target}: no images, expected at least one file.")
+    if len({path.stem for path in images}) < len(images):
+        raise InputError("convert: two images have one name, expected names that differ.")
+    camera = field.cameras[source]
+    known = landmarks(field, scene, source)
+    items = []
+    for path in images:
+        frame = Frame(source, 0, path, camera, np.eye(4))
+        raw = _pixels(field.sensors[source], frame)
+        found = register(field, known, raw, camera, source, str(path))
+        facts = {"covariance": found.covariance.tolist(), "sd_px": found.sd_px, "inliers": found.inliers, "residual": found.residual}
+        items.append(_Item(path.name, path.stem, camera, found.pose, None, functools.partial(_pixels, field.sensors[source], frame), facts))
+    return _convert_each(field, source, target, items, Path(out), method, progress)
+
+
+def _pixels(sensor: Sensor, frame: Frame) -> np.ndarray:
+    return load_frame(sensor, frame)[0]
+
+
+@dataclass(frozen=True)
+class _Item:
+    """A frame to convert: its file, the name of the results, camera and pose, those of the target if they are others, registration."""
+
+    file: str
+    name: str
+    camera: Camera
+    pose: np.ndarray
+    seen_by: tuple[Camera, np.ndarray] | None
+    read: Callable[[], np.ndarray]
+    registration: dict[str, Any]
+
+
+def _convert_each(
+    field: Field, source: str, target: str, items: Sequence[_Item], out: Path, method: str, progress: Progress | None
+) -> list[Path]:
+    sensor, folder = field.sensors[target], out / target
+    used = chosen_method(method, field.sensors[source], sensor)
+    rays = [sum(c.width * c.height for c in (i.camera, *(() if i.seen_by is None else (i.seen_by[0],)))) for i in items]
     count = Counter(progress, sum(rays))
     written: list[Path] = []
     exposure: float | None = None
-    for frame, (camera, pose, name), place, cost in zip(frames, chosen, places, rays, strict=True):
+    for item, cost in zip(items, rays, strict=True):
         goal = count.done + cost
-        pixels, _ = load_frame(scene.sensors[source], frame)
-        found = convert_frame(field, pixels, camera, pose, source, target, used, place, progress=count)
+        found = convert_frame(field, item.read(), item.camera, item.pose, source, target, used, item.seen_by, progress=count)
         count(goal - count.done)
-        sidecar = folder / f"{name}.json"
+        sidecar = folder / f"{item.name}.json"
         # a stale sidecar must not vouch for new files if this run is cut off
         sidecar.unlink(missing_ok=True)
-        data = folder / f"{name}.npz"
-        write_npz(data, _arrays(sensor, found, as_sensor))
+        data = folder / f"{item.name}.npz"
+        write_npz(data, _arrays(sensor, found, item.seen_by is not None))
         linear = previews.preview_linear(sensor, found.values)
         exposure = previews.exposure_of(linear) if exposure is None else exposure
-        pictures = {folder / f"{name}.png": previews.tone_map(linear, exposure), folder / f"{name}_confidence.png": found.confidence}
+        pictures = {
+            folder / f"{item.name}.png": previews.tone_map(linear, exposure),
+            folder / f"{item.name}_confidence.png": found.confidence,
+        }
         if found.stokes is not None:
-            pictures[folder / f"{name}_dolp.png"] = previews.preview_dolp(found.stokes)
-            pictures[folder / f"{name}_aolp.png"] = previews.preview_aolp(found.stokes)
+            pictures[folder / f"{item.name}_dolp.png"] = previews.preview_dolp(found.stokes)
+            pictures[folder / f"{item.name}_aolp.png"] = previews.preview_aolp(found.stokes)
         for path, picture in pictures.items():
             write_png16(path, picture)
         facts = {
-            "name": name,
+            "name": item.name,
+            "frame": item.file,
             "modality": target,
             "from": source,
             "method": found.method,
             "frame_exposure": found.exposure,
             "guided": float(found.guided.mean()),
+            "registration": item.registration or None,
             "sensor": sensor_json(sensor),
-            "camera": camera_json(*(place or (camera, pose))),
+            "camera": camera_json(*(item.seen_by or (item.camera, item.pose))),
             "conventions": CONVENTIONS,
             "unit": field.unit,
             "preview_exposure": exposure,

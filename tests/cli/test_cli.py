@@ -80,7 +80,28 @@ def test_convert(fitted: Path) -> None:
     result = run(fitted, "convert", "--from", "rgb", "--to", "ms", "--views", "9")
     assert result.returncode == 0, result.stderr
     (file,) = (fitted / "runs/latest/convert/rgb_to_ms").rglob("*.npz")
-    assert np.load(file)["data"].shape == (72, 96, 9)
+    found = np.load(file)
+    assert found["data"].shape == (72, 96, 9) and found["confidence"].shape == (72, 96)
+    own = run(fitted, "convert", "--from", "rgb", "--to", "nir", "--views", "9", "--method", "ratio", "--as-sensor", "--out", "own")
+    assert own.returncode == 0 and (fitted / "own/nir/0009.npz").is_file(), own.stderr
+    frame = next((data_folder("example_scene") / "modalities" / "rgb").glob("*9.png"))
+    # a fit of 25 steps has no surface to find a frame by
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--images", str(frame)), frame.name)
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--images", str(frame), "--views", "9"), "--images")
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--method", "magic"), "magic", "guided")
+
+
+def test_evaluate_conversions(fitted: Path) -> None:
+    result = run(fitted, "evaluate", "--convert", "rgb:ms,mono:pol", "--json")
+    assert result.returncode == 0, result.stderr
+    first, second = json.loads(result.stdout)["conversions"]
+    assert (first["source"], first["target"], first["truth"], first["auto"]) == ("rgb", "ms", "aligned", "guided")
+    assert {"field", "ratio", "guided", "linear", "nearest"} == set(second["methods"]) and second["truth"] == "own pose"
+    assert {"psnr", "sam", "ergas", "ssim", "rmse"} <= set(first["methods"]["guided"])
+    table = run(fitted, "evaluate", "--convert", "rgb:mono")
+    assert table.returncode == 0 and "ratio (auto)" in table.stdout
+    refused(run(fitted, "evaluate", "--convert", "rgb-ms"), "rgb-ms", "rgb:ms")
+    refused(run(fitted, "evaluate", "--convert", "rgb:thermal"), "thermal")
 
 
 def test_generate_dataset_resumes_and_verifies(fitted: Path) -> None:

@@ -157,7 +157,7 @@ def test_as_the_target_sensor_would_have_seen_it() -> None:
     expected = truth("ms", CAMERA, beside)
     told = lit & found.guided
     rms = lambda c: np.sqrt(np.mean((c.values - expected)[told] ** 2))
-    assert told.sum() > 0.8 * lit.sum() and rms(found) < rms(kept) / 3
+    assert told.sum() > 0.8 * lit.sum() and rms(found) < rms(kept) / 1.8  # six tenths of it are taken
     np.testing.assert_array_equal(found.values[~found.guided], kept.values[~found.guided])
     # the ball hides its own far side: from behind nothing of the frame is seen
     behind = convert_frame(field, frame(MONO), CAMERA, POSE, "mono", "ms", "ratio", (CAMERA, ring_pose(2, 4)))

@@ -1,0 +1,241 @@
+"""Where an unposed frame was taken: against the field.
+
+1. Features (SIFT, as root-SIFT) of the scene's training frames of the same sensor, each with its place on the field's surface; those of
+   the new frame are matched to the five training frames that share most with it, and give a pose by PnP with RANSAC.
+2. The pose is refined on the photosites themselves (Gauss-Newton, damped, robust): render, compare, move; the frame's exposure is free.
+
+The covariance is that of the second step, residuals taken as they are: what the field is wrong by counts as noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import torch
+
+from mmsynth.errors import InputError
+from mmsynth.fitting.poses import rigid
+from mmsynth.operations.progress import Progress
+from mmsynth.scene.images import load_frame
+from mmsynth.scene.scene import Scene, Sensor
+from mmsynth.sensors.camera import Camera, project, ray_map, unproject
+from mmsynth.sensors.mosaic import channel_map, demosaic
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field
+
+LEAST_INLIERS = 12
+WORST_SD_PX = 1.0
+_LARGER = 2  # frames are enlarged before features are sought: small pictures have few
+_NEIGHBOURS = 5
+_RATIO = 0.8  # Lowe's
+_RANSAC_PX = 2.0
+_RAYS, _STEPS = 4000, 12
+_HUBER = 0.03  # of residuals over the root of the light
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Features of one training frame: places (N, 3) in the scene's frame, descriptors (N, 128)."""
+
+    places: np.ndarray
+    descriptors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A frame's pose.
+
+    Attributes:
+        pose: (4, 4) camera_to_world. covariance: (6, 6) of a motion in the camera's axes, rotation [rad] and translation [scene unit].
+        sd_px: root mean square displacement of the picture by one standard deviation of the pose [px]. inliers: features that agree.
+        exposure: of the frame, in units of those that the field learned from. residual: rms of the light, relative.
+    """
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    sd_px: float
+    inliers: int
+    exposure: float
+    residual: float
+
+
+def landmarks(field: Field, scene: Scene, source: str, progress: Progress | None = None) -> list[Landmarks]:
+    """Features of the training frames of a sensor, on the field's surface; once for any number of frames to register."""
+    frames = scene.frames_of(source, scene.split.train)
+    out = []
+    for done, frame in enumerate(frames, 1):
+        raw, _ = load_frame(field.sensors[source], frame)
+        points, descriptors = _features(raw, field.sensors[source])
+        pose = field.pose_of(frame)
+        rays, valid = unproject(points, frame.camera)
+        depth = _depths(field, rays @ pose[:3, :3].T, pose, source)
+        valid &= np.isfinite(depth)
+        out.append(Landmarks((pose[:3, 3] + rays @ pose[:3, :3].T * depth[:, None])[valid], descriptors[valid]))
+        if progress is not None:
+            progress(done, len(frames))
+    return out
+
+
+def register(field: Field, known: list[Landmarks], raw: np.ndarray, camera: Camera, source: str, name: str = "frame") -> Registered:
+    """Find the pose of one frame.
+
+    Args:
+        known: see ``landmarks``. raw: (H, W) of a mosaic, else (H, W, C). name: for errors.
+    Raises:
+        InputError: too few features agree with the field, or the pose is not certain to a pixel; with the figures.
+    """
+    sensor = field.sensors[source]
+    points, descriptors = _features(raw, sensor)
+    pose, inliers = _by_features(points, descriptors, camera, known)
+    if pose is None or inliers < LEAST_INLIERS:
+        raise InputError(
+            f"{name}: {inliers} features agree with the field, expected at least {LEAST_INLIERS}: it does not show this scene."
+        )
+    found = _refined(field, raw, camera, pose, source, inliers)
+    if not found.sd_px < WORST_SD_PX:
+        raise InputError(f"{name}: its pose is uncertain by {found.sd_px:.2g} pixels, expected less than {WORST_SD_PX:g}.")
+    return found
+
+
+def _features(raw: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N, 2) px and root-SIFT descriptors (N, 128) of a frame."""
+    image = raw if sensor.mosaic is None else np.moveaxis(demosaic(torch.from_numpy(raw), sensor.mosaic).numpy(), 0, -1)
+    grey = image.mean(-1)
+    bright = max(float(np.quantile(grey, 0.995)), 1e-6)
+    shown = (255 * np.clip(grey / bright, 0.0, 1.0) ** (1 / 2.2)).astype(np.uint8)
+    shown = cv2.resize(shown, None, fx=_LARGER, fy=_LARGER, interpolation=cv2.INTER_CUBIC)
+    keys, found = cv2.SIFT_create(2000, contrastThreshold=0.01).detectAndCompute(shown, None)  # type: ignore[attr-defined]
+    if found is None or not keys:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    points = (np.array([key.pt for key in keys]) + 0.5) / _LARGER - 0.5
+    return points, np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-6)).astype(np.float32)
+
+
+def _by_features(points: np.ndarray, descriptors: np.ndarray, camera: Camera, known: list[Landmarks]) -> tuple[np.ndarray | None, int]:
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    agreed = []
+    for one in known:
+        if len(descriptors) < 2 or len(one.descriptors) < 2:
+            continue
+        pairs = matcher.knnMatch(descriptors, one.descriptors, k=2)
+        good = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < _RATIO * b.distance]
+        if good:
+            index = np.array(good)
+            agreed.append((index[:, 0], one.places[index[:, 1]]))
+    agreed.sort(key=lambda pair: -len(pair[0]))
+    if not agreed:
+        return None, 0
+    which, places = (np.concatenate(parts) for parts in zip(*agreed[:_NEIGHBOURS], strict=True))
+    rays, valid = unproject(points[which], camera)
+    valid &= rays[:, 2] > 0.1  # PnP is for points before the camera
+    ideal, places = (rays[:, :2] / rays[:, 2:])[valid], places[valid]
+    if len(places) < 4:
+        return None, len(places)
+    cv2.setRNGSeed(0)
+    limit = _RANSAC_PX / (0.5 * (camera.fx + camera.fy))
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        places, ideal, np.eye(3), None, iterationsCount=2000, reprojectionError=limit, confidence=0.9999, flags=cv2.SOLVEPNP_EPNP
+    )
+    if not found or inliers is None or len(inliers) < 4:
+        return None, 0 if inliers is None else len(inliers)
+    chosen = inliers[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(places[chosen], ideal[chosen], np.eye(3), None, turn, shift)
+    rotation = cv2.Rodrigues(turn)[0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ shift[:, 0]
+    return pose, len(chosen)
+
+
+@torch.no_grad()
+def _cast(field: Field, directions: np.ndarray, pose: np.ndarray, source: str, geometry: bool) -> dict[str, np.ndarray]:
+    """Rays of world directions (N, 3) from a camera."""
+    turned = torch.from_numpy(directions.astype(np.float32)).to(field.device)
+    origin = field.to_normalised(pose[:3, 3]).expand(len(turned), 3)
+    x = torch.from_numpy(pose[:3, 0].astype(np.float32)).to(field.device).expand(len(turned), 3)
+    return {k: v.cpu().numpy() for k, v in field.render_rays(origin, turned, x, [source], geometry).items()}
+
+
+def _depths(field: Field, directions: np.ndarray, pose: np.ndarray, source: str) -> np.ndarray:
+    if not len(directions):
+        return np.zeros(0)
+    return _cast(field, directions, pose, source, True)["depth"].astype(np.float64) * field.region.radius
+
+
+def _refined(field: Field, raw: np.ndarray, camera: Camera, pose: np.ndarray, source: str, inliers: int) -> Registered:
+    sensor = field.sensors[source]
+    rays, valid = ray_map(camera)
+    random = np.random.default_rng(0)
+    places = np.argwhere(valid)
+    places = places[random.permutation(len(places))[:_RAYS]]
+    v, u = places.T
+    index = np.zeros(len(v), np.int64) if sensor.mosaic is None else channel_map(sensor.mosaic, camera.height, camera.width)[v, u]
+    # of frames with all channels at every pixel, one at random
+    index = random.integers(sensor.channel_count, size=len(v)) if sensor.mosaic is None and sensor.channel_count > 1 else index
+    seen = raw[v, u].astype(np.float64) if raw.ndim == 2 else raw[v, u, index].astype(np.float64)
+    used = seen < sensor.saturation
+    v, u, index, seen = v[used], u[used], index[used], seen[used]
+    scale = 1.0 / np.sqrt(np.maximum(seen, 0.0) + 0.02)
+    local = rays[v, u]
+
+    def rendered(at: np.ndarray) -> np.ndarray:
+        return _cast(field, local @ at[:3, :3].T, at, source, False)[source][np.arange(len(v)), index].astype(np.float64)
+
+    def judged(light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
+        lit = light > 0.02
+        exposure = float(np.median(seen[lit] / light[lit])) if lit.sum() > 16 else 1.0
+        residual = (seen - exposure * light) * scale
+        weight = 1.0 / np.maximum(1.0, np.abs(residual) / _HUBER)
+        return float((weight * residual**2).sum()), residual, weight, exposure
+
+    # half a pixel of turning, and of moving as far off as the region is
+    distance = max(float(np.linalg.norm(pose[:3, 3] - np.array(field.region.centre))), 0.1 * field.region.radius)
+    half = 0.5 / (0.5 * (camera.fx + camera.fy))
+    unit = np.array([half] * 3 + [half * distance] * 3)
+    cost, residual, weight, exposure = judged(rendered(pose))
+    damping, normal = 1e-3, np.eye(6)
+    for _ in range(_STEPS):
+        columns = []
+        for k in range(6):
+            ahead, behind = (rendered(pose @ rigid((sign * unit * np.eye(6)[k])[None])[0]) for sign in (1.0, -1.0))
+            columns.append(-exposure * (ahead - behind) / 2.0 * scale)
+        slope = np.stack(columns, 1)
+        normal = (slope * weight[:, None]).T @ slope
+        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), (slope * weight[:, None]).T @ residual)
+        moved = pose @ rigid((step * unit)[None])[0]
+        other = judged(rendered(moved))
+        if other[0] < cost:
+            small = float(np.abs(step).max()) < 0.02
+            pose, (cost, residual, weight, exposure), damping = moved, other, max(damping / 5.0, 1e-6)
+            if small:
+                break
+        else:
+            damping *= 10.0
+            if damping > 10.0:
+                break
+    spread = float((weight * residual**2).sum() / max(weight.sum() - 6.0, 1.0))
+    in_steps = np.linalg.pinv(normal) * spread
+    light = (seen - residual / scale) / exposure
+    return Registered(
+        pose=pose,
+        covariance=unit[:, None] * in_steps * unit,
+        sd_px=_displacement(in_steps, unit, local * distance, camera),
+        inliers=inliers,
+        exposure=exposure,
+        residual=float(np.sqrt(np.mean((residual / scale) ** 2)) / max(float(np.mean(exposure * light)), 1e-6)),
+    )
+
+
+def _displacement(covariance: np.ndarray, unit: np.ndarray, points: np.ndarray, camera: Camera) -> float:
+    """Root mean square [px] by which points (N, 3) of the camera's axes move in the picture, of a motion (in units) of this covariance."""
+    before = project(points, camera)
+    moves = []
+    for k in range(6):
+        back = np.linalg.inv(rigid((unit * np.eye(6)[k])[None])[0])
+        moves.append(project(points @ back[:3, :3].T + back[:3, 3], camera) - before)
+    slope = np.stack(moves, -1)  # (N, 2, 6)
+    square = np.einsum("nik,kl,nil->n", slope, covariance, slope)
+    return float(np.sqrt(max(float(np.nanmean(square)), 0.0)))

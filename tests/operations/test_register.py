@@ -1,0 +1,94 @@
+"""A frame without a pose is found by what it shows, and refused where it shows something else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from analytic import RGB, ring_pose
+
+from mmsynth.errors import InputError
+from mmsynth.field.field import Design, Field
+from mmsynth.fitting.poses import motion_of, rigid
+from mmsynth.operations.convert import convert_images
+from mmsynth.operations.register import landmarks, register
+from mmsynth.scene.images import write_png16
+from mmsynth.scene.scene import Frame, Region, Scene, Split
+from mmsynth.sensors.camera import Camera, project
+from mmsynth.sensors.mosaic import mosaic
+
+CAMERA = Camera(160, 120, 170.0, 170.0, 79.2, 59.8, (-0.08, 0.02, 0.001, -0.001))
+
+
+@pytest.fixture(scope="module")
+def field() -> Field:
+    """A ball with fine random paint: what a field of hash grids is before it has learned anything, with more in its tables."""
+    torch.manual_seed(0)
+    design = Design(surface_levels=2, radiance_levels=4, surface_finest=8, radiance_finest=48, coarsest=6, occupancy=16, initial_radius=0.7)
+    made = Field(design, {"rgb": RGB}, {"rgb": 0.4}, Region((0.0, 0.0, 0.0), 1.0), cameras={"rgb": CAMERA}, rig={"rgb": np.eye(4)})
+    with torch.no_grad():
+        made.appearance.table.normal_(std=1.0)
+        for p in made.shader.parameters():
+            p.mul_(2.0)
+    made.sampling = type(made.sampling)(400.0, 0.005, 2, 4)
+    return made
+
+
+def _raw(field: Field, pose: np.ndarray, seed: int) -> np.ndarray:
+    image = np.nan_to_num(field.render(CAMERA, pose, geometry=False).channels["rgb"])
+    raw = mosaic(torch.from_numpy(image).movedim(-1, 0), RGB.mosaic).numpy()  # type: ignore[arg-type]
+    return np.clip(raw + 0.004 * np.random.default_rng(seed).normal(size=raw.shape), 0, 1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def scene(field: Field, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder, frames = tmp_path_factory.mktemp("frames"), []
+    for view in range(12):
+        path = folder / f"{view:04d}.png"
+        write_png16(path, _raw(field, ring_pose(view, 12), view))
+        frames.append(Frame("rgb", view, path, CAMERA, ring_pose(view, 12)))
+    return Scene(folder, "test", {"rgb": RGB}, tuple(frames), field.region, Split(tuple(range(11)), (11,), "test"), "m")
+
+
+def test_a_frame_is_found_to_a_fraction_of_a_pixel(field: Field, scene: Scene) -> None:
+    """Between two training views, nearer and turned; also when it is exposed twice as long."""
+    random = np.random.default_rng(0)
+    known = landmarks(field, scene, "rgb")
+    for exposure in (1.0, 0.5):
+        pose = ring_pose(1, 24) @ rigid(np.r_[random.normal(0, 0.05, 3), 0.02, -0.03, 0.25][None])[0]
+        found = register(field, known, (exposure * _raw(field, pose, 99)).astype(np.float32), CAMERA, "rgb")
+        points = 0.7 * np.array([[0.0, 0.0, 0.0], *np.eye(3), *-np.eye(3)])
+        shown = [project((points - p[:3, 3]) @ p[:3, :3], CAMERA) for p in (pose, found.pose)]
+        assert np.nanmax(np.linalg.norm(shown[0] - shown[1], axis=1)) < 0.2
+        off = motion_of((np.linalg.inv(pose) @ found.pose)[None])[0]
+        assert (np.abs(off) < 6 * np.sqrt(np.diag(found.covariance)) + 1e-5).all()
+        assert found.sd_px < 0.1 and found.inliers > 50 and found.exposure == pytest.approx(exposure, rel=0.03)
+
+
+@pytest.mark.parametrize("what", ["noise", "nothing", "another"])
+def test_a_frame_of_something_else_is_refused(field: Field, scene: Scene, what: str) -> None:
+    random = np.random.default_rng(1)
+    blocks = np.kron(random.random((15, 20)), np.ones((8, 8)))
+    raw = {"noise": random.random((120, 160)), "nothing": np.full((120, 160), 0.3), "another": blocks}[what].astype(np.float32)
+    with pytest.raises(InputError, match=r"photo\.png: (\d+ features agree|its pose is uncertain)"):
+        register(field, landmarks(field, scene, "rgb"), raw, CAMERA, "rgb", "photo.png")
+
+
+def test_images_without_a_pose_are_converted(field: Field, scene: Scene, tmp_path: Path) -> None:
+    pose = ring_pose(3, 24)
+    write_png16(tmp_path / "photo.png", _raw(field, pose, 5))
+    convert_images(field, scene, "rgb", "rgb", [tmp_path / "photo.png"], tmp_path / "out")
+    facts: dict[str, Any] = json.loads((tmp_path / "out/rgb/photo.json").read_text())
+    np.testing.assert_allclose(facts["camera"]["camera_to_world"], pose, atol=2e-3)
+    assert facts["registration"]["sd_px"] < 0.1 and np.shape(facts["registration"]["covariance"]) == (6, 6)
+    write_png16(tmp_path / "other.png", np.random.default_rng(0).random((120, 160)))
+    with pytest.raises(InputError, match=r"other\.png: "):
+        convert_images(field, scene, "rgb", "rgb", [tmp_path / "other.png"], tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
+    write_png16(tmp_path / "small.png", np.zeros((12, 16)))
+    with pytest.raises(InputError, match=r"small\.png: the image is 16x12 pixels, expected 160x120"):
+        convert_images(field, scene, "rgb", "rgb", [tmp_path / "small.png"], tmp_path / "refused")
