@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 LEAST_INLIERS = 12
 WORST_SD_PX = 1.0
+WORST_RESIDUAL = 0.6
+_GOOD_RESIDUAL = 0.4
+_LEAST_GUESS = 6
 _LARGER = 2  # frames are enlarged before features are sought: small pictures have few
 _NEIGHBOURS = 5
 _RATIO = 0.8  # Lowe's
@@ -86,16 +89,30 @@ def register(field: Field, known: list[Landmarks], raw: np.ndarray, camera: Came
     Args:
         known: see ``landmarks``. raw: (H, W) of a mosaic, else (H, W, C). name: for errors.
     Raises:
-        InputError: too few features agree with the field, or the pose is not certain to a pixel; with the figures.
+        InputError: too few features agree with the field, the frame does not look as the field does from there, or the pose is not certain
+            to a pixel; with the figures.
     """
     sensor = field.sensors[source]
     points, descriptors = _features(raw, sensor)
-    pose, inliers = _by_features(points, descriptors, camera, known)
-    if pose is None or inliers < LEAST_INLIERS:
+    guesses = _by_features(points, descriptors, camera, known)
+    inliers = max((count for _, count in guesses), default=0)
+    if inliers < LEAST_INLIERS:
         raise InputError(
             f"{name}: {inliers} features agree with the field, expected at least {LEAST_INLIERS}: it does not show this scene."
         )
-    found = _refined(field, raw, camera, pose, source, inliers)
+    # features that repeat agree on wrong poses, too: what the frame shows there decides
+    found = None
+    for pose, count in guesses:
+        refined = _refined(field, raw, camera, pose, source, count)
+        if found is None or refined.residual < found.residual:
+            found = refined
+        if found.residual < _GOOD_RESIDUAL:
+            break
+    assert found is not None
+    if not found.residual < WORST_RESIDUAL:
+        raise InputError(
+            f"{name}: at the best pose its light differs from the field's by {found.residual:.0%}, expected less than {WORST_RESIDUAL:.0%}."
+        )
     if not found.sd_px < WORST_SD_PX:
         raise InputError(f"{name}: its pose is uncertain by {found.sd_px:.2g} pixels, expected less than {WORST_SD_PX:g}.")
     return found
@@ -115,7 +132,8 @@ def _features(raw: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     return points, np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-6)).astype(np.float32)
 
 
-def _by_features(points: np.ndarray, descriptors: np.ndarray, camera: Camera, known: list[Landmarks]) -> tuple[np.ndarray | None, int]:
+def _by_features(points: np.ndarray, descriptors: np.ndarray, camera: Camera, known: list[Landmarks]) -> list[tuple[np.ndarray, int]]:
+    """Guesses of the pose and how many features agree: by the training frames that share most, together, then by each alone."""
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     agreed = []
     for one in known:
@@ -127,20 +145,26 @@ def _by_features(points: np.ndarray, descriptors: np.ndarray, camera: Camera, kn
             index = np.array(good)
             agreed.append((index[:, 0], one.places[index[:, 1]]))
     agreed.sort(key=lambda pair: -len(pair[0]))
-    if not agreed:
-        return None, 0
-    which, places = (np.concatenate(parts) for parts in zip(*agreed[:_NEIGHBOURS], strict=True))
+    groups = [agreed[:_NEIGHBOURS], *([pair] for pair in agreed[:_NEIGHBOURS])] if agreed else []
+    found = [_by_points(points, camera, group) for group in groups]
+    first, alone = found[:1], sorted(found[1:], key=lambda guess: -guess[1])
+    return [(pose, count) for pose, count in first + alone if pose is not None and count >= _LEAST_GUESS]
+
+
+def _by_points(points: np.ndarray, camera: Camera, group: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray | None, int]:
+    """PnP with RANSAC, of features (their numbers) and places."""
+    which, places = (np.concatenate(parts) for parts in zip(*group, strict=True))
     rays, valid = unproject(points[which], camera)
     valid &= rays[:, 2] > 0.1  # PnP is for points before the camera
     ideal, places = (rays[:, :2] / rays[:, 2:])[valid], places[valid]
-    if len(places) < 4:
+    if len(places) < _LEAST_GUESS:
         return None, len(places)
     cv2.setRNGSeed(0)
     limit = _RANSAC_PX / (0.5 * (camera.fx + camera.fy))
     found, turn, shift, inliers = cv2.solvePnPRansac(
         places, ideal, np.eye(3), None, iterationsCount=2000, reprojectionError=limit, confidence=0.9999, flags=cv2.SOLVEPNP_EPNP
     )
-    if not found or inliers is None or len(inliers) < 4:
+    if not found or inliers is None or len(inliers) < _LEAST_GUESS:
         return None, 0 if inliers is None else len(inliers)
     chosen = inliers[:, 0]
     turn, shift = cv2.solvePnPRefineLM(places[chosen], ideal[chosen], np.eye(3), None, turn, shift)

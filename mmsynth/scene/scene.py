@@ -105,14 +105,15 @@ def make_split(views: Iterable[int], test: Iterable[int] = (), source: str = "")
     """Split view ids by the ``test`` ids that the input states; the others train.
 
     Without any (or when they would leave nothing to train on) every tenth view tests: ids 9, 19, 29, ..., or the last
-    view if no id ends with 9.
+    view if no id ends with 9, or all do.
     """
     ids = sorted(set(views))
     stated = set(test)
     chosen = tuple(view for view in ids if view in stated)
     if not chosen or len(chosen) == len(ids):
-        chosen = tuple(view for view in ids if view % 10 == 9) or tuple(ids[-1:])
-        source = "every tenth view" if any(view % 10 == 9 for view in ids) else "the last view"
+        tenth = tuple(view for view in ids if view % 10 == 9)
+        regular = 0 < len(tenth) < len(ids)
+        chosen, source = (tenth, "every tenth view") if regular else (tuple(ids[-1:]), "the last view")
     return Split(tuple(view for view in ids if view not in chosen), chosen, source)
 
 

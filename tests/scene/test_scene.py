@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.scene import Scene, keep_frames
+from mmsynth.scene.scene import Scene, keep_frames, make_split
 
 SCENE = load_scene(data_folder("example_scene"))
 
@@ -47,3 +47,8 @@ def test_bad_limits() -> None:
         keep_frames(SCENE, {"thermal": 3})
     with pytest.raises(InputError, match="pol: 0 training frames"):
         keep_frames(SCENE, {"pol": 0})
+
+
+def test_views_that_all_end_with_nine_are_not_all_for_tests() -> None:
+    split = make_split([9, 19, 29])
+    assert split.train == (9, 19) and split.test == (29,) and split.source == "the last view"
