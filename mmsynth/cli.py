@@ -363,11 +363,12 @@ def simulate(
             split = {"train": scene.split.train, "test": scene.split.test, "all": None}
             chosen = split[views] if views in split else _views(views)
             written = twins.simulate_at_frames(field, scene, sensor, destination, chosen, seed, file_format, delta, progress=show)
-    print(
-        json.dumps({"scene": str(written.parent)})
-        if as_json
-        else f"wrote {written.parent}/ ({written.name}, modalities, sidecars, sensors)"
-    )
+    if as_json:
+        print(json.dumps({"scene": str(written.parent)}))
+        return
+    for line in twins.foretold(written.parent):
+        print(line)
+    print(f"wrote {written.parent}/ ({written.name}, modalities, sidecars, sensors)")
 
 
 @command("calibrate-noise")

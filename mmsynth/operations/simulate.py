@@ -357,6 +357,21 @@ def simulate_at_frames(
     return _write(field, planned, requests, Path(out), seed, format, progress)
 
 
+def foretold(scene: Path) -> list[str]:
+    """A line for each virtual sensor of a simulated scene whose channels are made of measured ones: how far off they are expected to be."""
+    lines = []
+    for folder in sorted((scene / "sidecars").iterdir()):
+        made = read_json(min(folder.iterdir()))["channels_made_of"]
+        if made:
+            errors = {label: c["residual"] for label, c in made.items()}
+            worst = max(errors, key=lambda label: errors[label])
+            lines.append(
+                f"{folder.name}: {len(made)} channels made of measured ones, expected errors {min(errors.values()):.1%} to "
+                f"{errors[worst]:.1%} ({worst})"
+            )
+    return lines
+
+
 def _planned(field: Field, sensors: Sequence[str | Path], format: str, delta: bool) -> list[Simulated]:
     if format not in FORMATS:
         raise InputError(f"simulate: format is {format!r}, expected one of {', '.join(FORMATS)}.")

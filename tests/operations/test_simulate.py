@@ -13,7 +13,7 @@ import rawpy
 from analytic import MONO, MS, POL, RGB, AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.operations.simulate import plan_sensor, simulate, simulate_at_frames, simulate_frame
+from mmsynth.operations.simulate import foretold, plan_sensor, simulate, simulate_at_frames, simulate_frame
 from mmsynth.scene.images import read_native
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region
@@ -169,6 +169,9 @@ def test_a_virtual_channel_that_is_a_measured_one_is_it(field: Any, tmp_path: Pa
     raw = simulate_frame(field, planned, camera, VIEWS[0][1], 0).astype(float)
     truth = field.render(camera, VIEWS[0][1], ["ms"]).channels["ms"][..., 3] * 4095.94
     assert abs(np.median(raw / truth) - 1) < 0.01
+    out = simulate(field, [file], VIEWS[:1], tmp_path / "out")
+    error = f"{planned.combinations['x'].residual:.1%}"
+    assert foretold(out.parent) == [f"band: 1 channels made of measured ones, expected errors {error} to {error} (x)"]
 
 
 def test_what_cannot_be_expressed_is_refused_with_the_reason(field: Any, tmp_path: Path) -> None:
