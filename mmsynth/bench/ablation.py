@@ -16,7 +16,6 @@ A table is a TOML file of variants, the first of which is the baseline and chang
 from __future__ import annotations
 
 import statistics
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.operations.progress import Progress
 from mmsynth.scene.scene import canonical_modality
+from mmsynth.toml import first_problem, read_toml
 
 
 class Variant(BaseModel):
@@ -78,19 +78,12 @@ def load_table(name_or_path: str) -> list[Variant]:
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
             raise InputError(f"table {name_or_path!r}: not found, expected one of {known} or a TOML file.")
-    try:
-        variants = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8"))).variant
-    except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror}).") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML ({error}).") from error
-    except ValidationError as error:
-        raise InputError(f"{path}: {_first(error)}.") from error
+    variants = read_toml(path, _File).variant
     for variant in variants:
         try:
             variant.fitted_recipe()
         except ValidationError as error:
-            raise InputError(f"{path}: variant {variant.name!r}: recipe.{_first(error)}.") from error
+            raise InputError(f"{path}: variant {variant.name!r}: recipe.{first_problem(error)}.") from error
     names = [variant.name for variant in variants]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -98,11 +91,6 @@ def load_table(name_or_path: str) -> list[Variant]:
     if variants[0].changes:
         raise InputError(f"{path}: variant {names[0]!r} is the first and so the baseline, which must change nothing.")
     return variants
-
-
-def _first(error: ValidationError) -> str:
-    first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
 def bench_ablation(

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
+import numpy as np
 
 from mmsynth.bench.machine import use_threads
+from mmsynth.bench.tables import Column, Table
 from mmsynth.errors import InputError
 from mmsynth.operations.progress import Progress
 
@@ -92,3 +94,21 @@ def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
         }
         for method, taken, found in zip(group, times, judged, strict=True)
     ]  # fmt: skip
+
+
+def typical(error: np.ndarray) -> dict[str, float]:
+    """``error``: root mean square, and ``worst``."""
+    error = np.asarray(error, dtype=np.float64)
+    return {"error": float(np.sqrt(np.mean(error**2))), "worst": float(error.max())} if error.size else {}
+
+
+def family_tables(
+    rows: Sequence[Mapping[str, Any]],
+    columns: Sequence[Column],
+    families: Sequence[Callable[..., Any]],
+    more: Mapping[str, str] | None = None,
+) -> list[Table]:
+    """A table per family that has rows; its note is the first line of its function's docstring, and what ``more`` adds."""
+    notes = {f.__name__.replace("_", " "): (f.__doc__ or "").split("\n")[0] + (more or {}).get(f.__name__, "") for f in families}
+    here = dict.fromkeys(row["family"] for row in rows)
+    return [Table(name.capitalize(), columns, [row for row in rows if row["family"] == name], notes[name]) for name in here]

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from mmsynth.bench.machine import measure
-from mmsynth.bench.methods import REPEATS, Method, measured
+from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, typical
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.field.kernels import reference
@@ -38,11 +38,6 @@ from mmsynth.sensors.polarization import (
 
 _RGGB = np.array([[0, 1], [1, 2]])
 _POL, _POL_ANGLES = np.array([[2, 1], [3, 0]]), (0.0, 45.0, 90.0, 135.0)
-
-
-def _typical(error: np.ndarray) -> dict[str, float]:
-    error = np.asarray(error, dtype=np.float64)
-    return {"error": float(np.sqrt(np.mean(error**2))), "worst": float(error.max())} if error.size else {}
 
 
 # ------------------------------------------------------------------------------------------------------------------- the families
@@ -137,7 +132,7 @@ def opacity() -> list[Method]:
             )
 
             def judge(found: Tensor, exact: Tensor = exact) -> dict[str, float]:
-                return _typical((found.double() - exact).abs().numpy())
+                return typical((found.double() - exact).abs().numpy())
 
             for name, run in (
                 ("NeuS, 1e-5, float32", functools.partial(neus, torch.float32)),
@@ -167,7 +162,7 @@ def normals() -> list[Method]:
 
     def judge(found: Tensor) -> dict[str, float]:
         angle = torch.atan2(torch.linalg.cross(found, outward).norm(dim=1), (found * outward).sum(1))
-        return _typical(torch.rad2deg(angle).numpy())
+        return typical(torch.rad2deg(angle).numpy())
 
     methods = []
     for epsilon in (1 / 64, 1 / 256, 1 / 1024, 1 / 4096):
@@ -196,7 +191,7 @@ def angles() -> list[Method]:
             ("atan2 (mmsynth)", lambda x, y: torch.atan2(torch.linalg.cross(x, y).norm(dim=1), (x * y).sum(1))),
         )
         for name, way in ways:
-            judge = lambda found, size=size: _typical(np.degrees((found.double() - size).abs().numpy()))
+            judge = lambda found, size=size: typical(np.degrees((found.double() - size).abs().numpy()))
             methods.append(Method("angles", f"{size:.5g} rad", name, functools.partial(way, one, other), judge, len(a), "°"))
     return methods
 
@@ -222,7 +217,7 @@ def demosaicking() -> list[Method]:
 
     def judge(found: Any) -> dict[str, float]:
         error = np.abs(np.asarray(found, dtype=np.float64) - image.numpy())[:, 4:-4, 4:-4]
-        return _typical(error) | {"psnr": -20 * math.log10(float(np.sqrt(np.mean(error**2))))}
+        return typical(error) | {"psnr": -20 * math.log10(float(np.sqrt(np.mean(error**2))))}
 
     by_opencv = lambda code: np.moveaxis(cv2.demosaicing(codes, code) / 65535.0, -1, 0)
     ways: list[tuple[str, Callable[[], Any]]] = [
@@ -242,7 +237,7 @@ def demosaicking() -> list[Method]:
         return blocks[..., [3, 1, 0, 2]]  # the pattern's channels in order
 
     def false_degree(found: Tensor) -> dict[str, float]:
-        return _typical(degree_of_linear_polarization(intensities_to_stokes(found, _POL_ANGLES)).numpy()[2:-2, 2:-2])
+        return typical(degree_of_linear_polarization(intensities_to_stokes(found, _POL_ANGLES)).numpy()[2:-2, 2:-2])
 
     for name, run in (
         ("mmsynth, normalised convolution", lambda: demosaic(frame, _POL).movedim(0, -1)),
@@ -263,7 +258,7 @@ def resampling() -> list[Method]:
         return torch.nn.functional.interpolate(images[None], scale_factor=2, mode=mode, align_corners=False)[0]
 
     def judge(found: Tensor) -> dict[str, float]:
-        return _typical(aolp_difference(found, truth).abs().numpy()[4:-4, 4:-4])
+        return typical(aolp_difference(found, truth).abs().numpy()[4:-4, 4:-4])
 
     methods = []
     for mode in ("bilinear", "bicubic"):
@@ -308,10 +303,7 @@ def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         Column("masked", "missing", ".2%"),
         Column("PSNR [dB]", "psnr", ".2f"),
     )
-    notes = {family.__name__: (family.__doc__ or "").split("\n")[0] for family in FAMILIES}
-    notes["undistortion"] += " Error: the median. Wrong: by more than 0.1 px, or behind the fold."
-    families = dict.fromkeys(row["family"] for row in rows)
-    return [Table(name.capitalize(), columns, [row for row in rows if row["family"] == name], notes[name]) for name in families]
+    return family_tables(rows, columns, FAMILIES, {"undistortion": " Error: the median. Wrong: by more than 0.1 px, or behind the fold."})
 
 
 def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:

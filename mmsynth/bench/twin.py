@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from mmsynth.bench.machine import measure
-from mmsynth.bench.methods import REPEATS, Method, measured, measured_methods
+from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, measured_methods, typical
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.operations.progress import Progress
@@ -138,9 +138,7 @@ def supersampling() -> list[Method]:
     picture = lambda s: _star(fine_camera(Camera(80, 60, 50.0, 50.0, 39.5, 29.5), s))
     truth = aperture(picture(32), 32)
 
-    def judge(found: Tensor) -> dict[str, float]:
-        error = (found - truth).abs()
-        return {"error": float(error.square().mean().sqrt()), "worst": float(error.max())}
+    judge = lambda found: typical((found - truth).abs().numpy())
 
     run = lambda s: aperture(picture(s), s)
     return [
@@ -157,7 +155,7 @@ def _star(camera: Camera) -> Tensor:
     return torch.where(radius < 0.15, 0.7, (torch.sin(36.0 * angle) > 0).float())[None]
 
 
-def supersampling_of_a_field(field: Field) -> list[Method]:
+def of_the_field(field: Field) -> list[Method]:
     """The first sensor of a fitted field, rays per pixel along each axis, against 8 x 8."""
     from mmsynth.operations.simulate import Simulated, render_light
 
@@ -174,9 +172,7 @@ def supersampling_of_a_field(field: Field) -> list[Method]:
 
     truth = light(8)
 
-    def judge(found: Tensor) -> dict[str, float]:
-        error = (found - truth).abs()
-        return {"error": float(error.square().mean().sqrt()), "worst": float(error.max())}
+    judge = lambda found: typical((found - truth).abs().numpy())
 
     count = camera.width * camera.height
     return [Method("of the field", name, f"{s} x {s}", functools.partial(light, s), judge, count, "full scale") for s in (1, 2, 3, 4)]
@@ -268,7 +264,7 @@ def bench_twin(
     """
     rows = measured(FAMILIES, "twin", only, repeats, progress)
     if field is not None:
-        rows += measured_methods(supersampling_of_a_field(field), min(repeats, 3), progress)
+        rows += measured_methods(of_the_field(field), min(repeats, 3), progress)
     results = {"bench": "twin", "machine": measure(), "rows": rows, "repeats": repeats}
     return write_report(results, tables_of(rows), plot(rows), out)
 
@@ -291,10 +287,7 @@ def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         Column("PRNU", "prnu", ".1%"),
         Column("in", "unit"),
     )
-    notes = {family.__name__: (family.__doc__ or "").split("\n")[0] for family in FAMILIES}
-    notes["of the field"] = (supersampling_of_a_field.__doc__ or "").split("\n")[0]
-    families = dict.fromkeys(row["family"] for row in rows)
-    return [Table(name.capitalize(), columns, [row for row in rows if row["family"] == name], notes[name]) for name in families]
+    return family_tables(rows, columns, (*FAMILIES, of_the_field))
 
 
 def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:

@@ -215,6 +215,13 @@ class Field(nn.Module):
             out["depth"], out["normal"] = depth, normal
         return out
 
+    def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
+        """``render_rays`` of rays of one camera: directions (R, 3) in its axes, scene frame; depth stays in radii."""
+        turned = torch.from_numpy((directions @ camera_to_world[:3, :3].T).astype(np.float32)).to(self.device)
+        origin = self.to_normalised(camera_to_world[:3, 3]).expand(len(turned), 3)
+        camera_x = torch.from_numpy(camera_to_world[:3, 0].astype(np.float32)).to(self.device).expand(len(turned), 3)
+        return {key: value.cpu().numpy() for key, value in self.render_rays(origin, turned, camera_x, modalities, geometry).items()}
+
     def render(
         self,
         camera: Camera,
@@ -239,14 +246,12 @@ class Field(nn.Module):
         in_camera, valid = ray_map(camera)
         height, width = valid.shape
         rows = np.flatnonzero(valid)
-        directions = torch.from_numpy((in_camera.reshape(-1, 3)[rows] @ pose[:3, :3].T).astype(np.float32)).to(self.device)
-        origin = self.to_normalised(pose[:3, 3])
-        camera_x = torch.from_numpy(pose[:3, 0].astype(np.float32)).to(self.device)
+        directions = in_camera.reshape(-1, 3)[rows]
         parts: dict[str, list[np.ndarray]] = {}
-        for part in directions.split(8192):
-            result = self.render_rays(origin.expand(len(part), 3), part, camera_x.expand(len(part), 3), names, geometry)
-            for key, value in result.items():
-                parts.setdefault(key, []).append(value.cpu().numpy())
+        for start in range(0, len(directions), 8192):
+            part = directions[start : start + 8192]
+            for key, value in self.cast(part, pose, names, geometry).items():
+                parts.setdefault(key, []).append(value)
             if progress is not None:
                 progress(len(part))
 

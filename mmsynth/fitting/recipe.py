@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from mmsynth.data import data_folder
 from mmsynth.errors import InputError
+from mmsynth.toml import read_toml
 
 
 class Recipe(BaseModel):
@@ -99,12 +99,4 @@ def load_recipe(name_or_path: str | None) -> Recipe:
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
             raise InputError(f"recipe {name_or_path!r}: not found, expected one of {known} or a TOML file.")
-    try:
-        return Recipe.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror}).") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML ({error}).") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
+    return read_toml(path, Recipe)

@@ -24,7 +24,7 @@ from mmsynth.files import write_atomic, write_json
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.scene.images import read_native, used_bits
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
-from mmsynth.sensors.mosaic import crop_pattern
+from mmsynth.sensors.mosaic import channel_map, crop_pattern
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.photon_transfer import PhotonTransfer, photon_transfer_of_frames
 from mmsynth.sensors.sensor_file import SensorFile, save_sensor
@@ -207,10 +207,10 @@ def _with(file: SensorFile, found: PhotonTransfer) -> SensorFile:
 def _blurred(raw: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """(H, W, C): every channel at every pixel, a Gaussian mean of its own photosites."""
     rows, columns = pattern.shape
-    tiled = np.tile(pattern, (-(-raw.shape[0] // rows), -(-raw.shape[1] // columns)))[: raw.shape[0], : raw.shape[1]]
+    measured = channel_map(pattern, *raw.shape)
     out = []
     for channel in range(int(pattern.max()) + 1):
-        here = (tiled == channel).astype(np.float64)
+        here = (measured == channel).astype(np.float64)
         smooth = lambda image: gaussian_filter(image, (_BLUR * rows, _BLUR * columns), mode="nearest")
         out.append(smooth(raw * here) / smooth(here))
     return np.stack(out, -1)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_json
@@ -22,10 +21,10 @@ from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import load_frame, write_npz, write_png16
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera
-from mmsynth.sensors.mosaic import mosaic
+from mmsynth.sensors.mosaic import photosites_of
 
 if TYPE_CHECKING:
-    from mmsynth.field.field import Field, Rendering
+    from mmsynth.field.field import Field
 
 
 def wavelengths_array(sensor: Sensor) -> np.ndarray:
@@ -63,15 +62,15 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def modality_arrays(sensor: Sensor, rendering: Rendering) -> dict[str, np.ndarray]:
+def modality_arrays(sensor: Sensor, values: np.ndarray, stokes: np.ndarray | None) -> dict[str, np.ndarray]:
     """What a file of one modality holds: data (H, W, C), channels, wavelengths_nm (NaN = none) and, for polarization, stokes (H, W, 3)."""
     arrays = {
-        "data": rendering.channels[sensor.name].astype(np.float32),
+        "data": values.astype(np.float32),
         "channels": np.array(sensor.channels, dtype=np.str_),
         "wavelengths_nm": wavelengths_array(sensor),
     }
-    if sensor.is_polarization:
-        arrays["stokes"] = rendering.stokes[sensor.name].astype(np.float32)
+    if stokes is not None:
+        arrays["stokes"] = stokes.astype(np.float32)
         arrays["polarizer_angles_deg"] = np.array(sensor.polarizer_angles_deg, np.float32)
     return arrays
 
@@ -264,20 +263,10 @@ def _place(field: Field, scene: Scene, source: str, target: str, frame: Frame) -
 
 
 def _arrays(sensor: Sensor, found: Converted, as_sensor: bool) -> dict[str, np.ndarray]:
-    arrays = {
-        "data": found.values,
-        "channels": np.array(sensor.channels, dtype=np.str_),
-        "wavelengths_nm": wavelengths_array(sensor),
-        "opacity": found.opacity,
-        "valid": found.valid,
-        "confidence": found.confidence,
-        "guided": found.guided,
-    }
-    if found.stokes is not None:
-        arrays["stokes"] = found.stokes
-        arrays["polarizer_angles_deg"] = np.array(sensor.polarizer_angles_deg, np.float32)
+    arrays = modality_arrays(sensor, found.values, found.stokes)
+    arrays |= {"opacity": found.opacity, "valid": found.valid, "confidence": found.confidence, "guided": found.guided}
     if as_sensor and sensor.mosaic is not None:
-        arrays["raw"] = mosaic(torch.from_numpy(found.values).movedim(-1, 0), sensor.mosaic).numpy()
+        arrays["raw"] = photosites_of(found.values, sensor.mosaic)
     return arrays
 
 

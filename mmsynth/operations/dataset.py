@@ -205,7 +205,7 @@ def _write(folder: Path, stem: str, arrays: Mapping[str, np.ndarray], format: st
 
 
 def _write_modality(folder: Path, sensor: Sensor, rendering: Rendering, format: str) -> dict[str, Any]:
-    arrays = modality_arrays(sensor, rendering)
+    arrays = modality_arrays(sensor, rendering.channels[sensor.name], rendering.stokes.get(sensor.name))
     if format == "npz":
         return _write(folder, sensor.name, arrays, format)
     image, stokes = arrays["data"], arrays.get("stokes")

@@ -38,7 +38,7 @@ from mmsynth.operations.progress import Counter, Progress
 from mmsynth.scene.images import load_frame, read_native
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera, ray_map
-from mmsynth.sensors.mosaic import mosaic
+from mmsynth.sensors.mosaic import photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Renderi
     if alpha is not None:
         # what is transparent was never seen
         measured = measured * alpha[..., None]
-    predicted = channels if sensor.mosaic is None else mosaic(torch.from_numpy(channels).movedim(-1, 0), sensor.mosaic).numpy()
+    predicted = channels if sensor.mosaic is None else photosites_of(channels, sensor.mosaic)
     squared = (predicted - measured) ** 2
     drawn = _mask(frame)
     if drawn is None and alpha is not None:

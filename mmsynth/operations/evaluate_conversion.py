@@ -22,13 +22,13 @@ import torch
 from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis, structural_similarity_index_measure
 
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion import METHODS, Converted, carried_through, convert_frame
+from mmsynth.operations.conversion import METHODS, Converted, carried_through, chosen_method, convert_frame
 from mmsynth.operations.evaluate import GroundTruth, psnr_from_mse, spectral_angle_deg
 from mmsynth.operations.progress import Progress
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera
-from mmsynth.sensors.mosaic import demosaic, mosaic
+from mmsynth.sensors.mosaic import channels_of, photosites_of
 from mmsynth.sensors.polarization import (
     angle_of_linear_polarization,
     aolp_difference,
@@ -40,7 +40,6 @@ from mmsynth.sensors.polarization import (
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
-BASELINES = ("linear", "nearest")
 _LEARNED_FROM = 8  # renderings for the linear map
 
 
@@ -67,7 +66,8 @@ def evaluate_conversion(
     aligned = source == "rgb" and all(target in truth.aligned(f.view) for f in frames)
     matrix = _linear(field, scene, source, target)
     totals: dict[str, list[dict[str, np.ndarray]]] = {}
-    kind, seconds, used = "aligned", 0.0, ""
+    kind, seconds = "aligned", 0.0
+    used = chosen_method("auto", field.sensors[source], field.sensors[target])
     judged: list[int] = []
     for done, frame in enumerate(frames, 1):
         raw, _ = load_frame(field.sensors[source], frame)
@@ -79,15 +79,14 @@ def evaluate_conversion(
         light, region, kind = _truth_of(truth, field.sensors[target], frame, own)
         results: dict[str, np.ndarray] = {}
         for method in METHODS[1:]:
-            results[method] = _values(convert_frame(field, raw, frame.camera, pose, source, target, method, seen_by), field.sensors[target])
-        began = time.perf_counter()
-        auto = convert_frame(field, raw, frame.camera, pose, source, target, "auto", seen_by)
-        seconds += time.perf_counter() - began
-        used = auto.method
+            began = time.perf_counter()
+            found = convert_frame(field, raw, frame.camera, pose, source, target, method, seen_by)
+            seconds += (time.perf_counter() - began) * (method == used)
+            results[method] = _values(found, field.sensors[target])
         results["linear"] = _by_linear(field, raw, frame, pose, source, matrix, seen_by, results["field"])
         results["nearest"] = _by_nearest(field, scene, target, seen_by or (frame.camera, pose), results["field"])
         for name, values in results.items():
-            totals.setdefault(name, []).append(_errors(values, light, auto.valid, region, field.sensors[target], kind))
+            totals.setdefault(name, []).append(_errors(values, light, found.valid, region, field.sensors[target], kind))
         judged.append(frame.view)
         if progress is not None:
             progress(done, len(frames))
@@ -118,10 +117,6 @@ def _truth_of(truth: GroundTruth, target: Sensor, frame: Frame, own: Frame | Non
 
 def _values(found: Converted, target: Sensor) -> np.ndarray:
     return (found.stokes if target.is_polarization and found.stokes is not None else found.values).astype(np.float64)
-
-
-def _channels(raw: np.ndarray, sensor: Sensor) -> np.ndarray:
-    return raw if sensor.mosaic is None else np.moveaxis(demosaic(torch.from_numpy(raw), sensor.mosaic).numpy(), 0, -1)
 
 
 def _as_light(values: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -155,7 +150,7 @@ def _by_linear(
     seen_by: tuple[Camera, np.ndarray] | None,
     otherwise: np.ndarray,
 ) -> np.ndarray:
-    channels = _channels(raw, field.sensors[source]).astype(np.float64)
+    channels = channels_of(raw, field.sensors[source].mosaic).astype(np.float64)
     values = np.concatenate([channels, np.ones((*channels.shape[:2], 1))], -1) @ matrix
     if seen_by is None:
         return np.asarray(values)
@@ -170,7 +165,7 @@ def _by_nearest(field: Field, scene: Scene, target: str, seen_by: tuple[Camera, 
     if not frames:
         return otherwise
     nearest = min(frames, key=lambda f: float(np.linalg.norm(field.pose_of(f)[:3, 3] - pose[:3, 3])))
-    values = _as_light(_channels(load_frame(field.sensors[target], nearest)[0], field.sensors[target]), field.sensors[target])
+    values = _as_light(channels_of(load_frame(field.sensors[target], nearest)[0], field.sensors[target].mosaic), field.sensors[target])
     carried, visible = carried_through(field, values, (nearest.camera, field.pose_of(nearest)), seen_by)
     return np.where(visible[..., None], carried, otherwise)
 
@@ -184,7 +179,7 @@ def _errors(
     seen = intensities(values) if target.is_polarization else values
     if kind == "raw":
         if target.mosaic is not None:
-            seen = mosaic(torch.from_numpy(seen).movedim(-1, 0), target.mosaic).numpy()
+            seen = photosites_of(seen, target.mosaic)
         real = light if light.ndim == seen.ndim else light[..., None]
     else:
         real = intensities(light) if target.is_polarization else light

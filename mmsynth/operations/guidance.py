@@ -18,11 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from mmsynth.scene.scene import Sensor
-from mmsynth.sensors.mosaic import channel_map, demosaic
+from mmsynth.sensors.mosaic import channel_map, channels_of
 
 # of a photosite whose sensor nobody calibrated: shot noise of 10,000 electrons at full scale, and a floor
 SHOT, FLOOR = 1e-4, 1e-6
@@ -113,11 +112,9 @@ def _rest(
     left: np.ndarray, expected: np.ndarray, variance: np.ndarray, used: np.ndarray, sensor: Sensor, gain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rest of colour at every pixel (H, W, C), and where it is too large to be an error of the field."""
-    if sensor.mosaic is None:
-        full, noise = np.where(used, left, 0.0), variance
-    else:
-        full = np.moveaxis(demosaic(torch.from_numpy(np.where(used, left, 0.0)[..., 0]), sensor.mosaic).numpy(), 0, -1)
-        noise = np.broadcast_to(variance, full.shape)
+    known = np.where(used, left, 0.0)
+    full = channels_of(known if sensor.mosaic is None else known[..., 0], sensor.mosaic)
+    noise = np.broadcast_to(variance, full.shape)
     smooth = lambda x: gaussian_filter(x, (_REST_WINDOW, _REST_WINDOW, 0), mode="nearest")
     low = smooth(full)
     # of independent values a window of σ leaves 1 / (4 π σ²) of the variance; a mosaic has fewer of each channel

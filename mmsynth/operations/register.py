@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import torch
 
 from mmsynth.errors import InputError
 from mmsynth.fitting.poses import rigid
@@ -22,7 +21,7 @@ from mmsynth.operations.progress import Progress
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Scene, Sensor
 from mmsynth.sensors.camera import Camera, project, ray_map, unproject
-from mmsynth.sensors.mosaic import channel_map, demosaic
+from mmsynth.sensors.mosaic import channel_map, channels_of
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -75,7 +74,7 @@ def landmarks(field: Field, scene: Scene, source: str, progress: Progress | None
         points, descriptors = _features(raw, field.sensors[source])
         pose = field.pose_of(frame)
         rays, valid = unproject(points, frame.camera)
-        depth = _depths(field, rays @ pose[:3, :3].T, pose, source)
+        depth = field.cast(rays, pose, [source], True)["depth"].astype(np.float64) * field.region.radius if len(rays) else np.zeros(0)
         valid &= np.isfinite(depth)
         out.append(Landmarks((pose[:3, 3] + rays @ pose[:3, :3].T * depth[:, None])[valid], descriptors[valid]))
         if progress is not None:
@@ -120,8 +119,7 @@ def register(field: Field, known: list[Landmarks], raw: np.ndarray, camera: Came
 
 def _features(raw: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Places (N, 2) px and root-SIFT descriptors (N, 128) of a frame."""
-    image = raw if sensor.mosaic is None else np.moveaxis(demosaic(torch.from_numpy(raw), sensor.mosaic).numpy(), 0, -1)
-    grey = image.mean(-1)
+    grey = channels_of(raw, sensor.mosaic).mean(-1)
     bright = max(float(np.quantile(grey, 0.995)), 1e-6)
     shown = (255 * np.clip(grey / bright, 0.0, 1.0) ** (1 / 2.2)).astype(np.uint8)
     shown = cv2.resize(shown, None, fx=_LARGER, fy=_LARGER, interpolation=cv2.INTER_CUBIC)
@@ -174,21 +172,6 @@ def _by_points(points: np.ndarray, camera: Camera, group: list[tuple[np.ndarray,
     return pose, len(chosen)
 
 
-@torch.no_grad()
-def _cast(field: Field, directions: np.ndarray, pose: np.ndarray, source: str, geometry: bool) -> dict[str, np.ndarray]:
-    """Rays of world directions (N, 3) from a camera."""
-    turned = torch.from_numpy(directions.astype(np.float32)).to(field.device)
-    origin = field.to_normalised(pose[:3, 3]).expand(len(turned), 3)
-    x = torch.from_numpy(pose[:3, 0].astype(np.float32)).to(field.device).expand(len(turned), 3)
-    return {k: v.cpu().numpy() for k, v in field.render_rays(origin, turned, x, [source], geometry).items()}
-
-
-def _depths(field: Field, directions: np.ndarray, pose: np.ndarray, source: str) -> np.ndarray:
-    if not len(directions):
-        return np.zeros(0)
-    return _cast(field, directions, pose, source, True)["depth"].astype(np.float64) * field.region.radius
-
-
 def _refined(field: Field, raw: np.ndarray, camera: Camera, pose: np.ndarray, source: str, inliers: int) -> Registered:
     sensor = field.sensors[source]
     rays, valid = ray_map(camera)
@@ -206,7 +189,7 @@ def _refined(field: Field, raw: np.ndarray, camera: Camera, pose: np.ndarray, so
     local = rays[v, u]
 
     def rendered(at: np.ndarray) -> np.ndarray:
-        return _cast(field, local @ at[:3, :3].T, at, source, False)[source][np.arange(len(v)), index].astype(np.float64)
+        return field.cast(local, at, [source], False)[source][np.arange(len(v)), index].astype(np.float64)
 
     def judged(light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
         lit = light > 0.02

@@ -20,7 +20,7 @@ from mmsynth.files import write_text
 from mmsynth.operations import previews
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor
-from mmsynth.sensors.mosaic import demosaic, demosaic_edge_aware, is_bayer
+from mmsynth.sensors.mosaic import channels_of, demosaic_edge_aware, is_bayer
 from mmsynth.sensors.polarization import intensities_to_stokes
 
 if TYPE_CHECKING:
@@ -127,11 +127,9 @@ def _source(image: np.ndarray) -> str:
 def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
     """A frame with all channels at every pixel (H, W, C), demosaicked for display."""
     pixels, _ = load_frame(sensor, frame)
-    if sensor.mosaic is None:
-        return pixels
-    if is_bayer(sensor.mosaic):
+    if sensor.mosaic is not None and is_bayer(sensor.mosaic):
         return np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
-    return demosaic(torch.from_numpy(pixels), sensor.mosaic).movedim(0, -1).numpy()
+    return channels_of(pixels, sensor.mosaic)
 
 
 def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tuple[str, np.ndarray]]]]:

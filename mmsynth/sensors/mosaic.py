@@ -69,6 +69,16 @@ def demosaic(raw: Tensor, pattern: np.ndarray, offset: tuple[int, int] = (0, 0))
     return torch.where(present, frames, filled).reshape(*raw.shape[:-2], channels, height, width)
 
 
+def photosites_of(image: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """``mosaic`` of a picture as files and renderings have it: (H, W, C) → (H, W)."""
+    return mosaic(torch.from_numpy(image).movedim(-1, 0), pattern).numpy()
+
+
+def channels_of(frame: np.ndarray, pattern: np.ndarray | None) -> np.ndarray:
+    """``demosaic`` of a frame as files have it: (H, W) → (H, W, C); without a pattern it has all channels already."""
+    return frame if pattern is None else demosaic(torch.from_numpy(frame), pattern).movedim(0, -1).numpy()
+
+
 def is_bayer(pattern: np.ndarray) -> bool:
     """Whether a pattern is one of Bayer's four, of red, green and blue as channels 0, 1, 2."""
     return tuple(map(tuple, pattern.tolist())) in BAYER

@@ -9,13 +9,12 @@ from the responses of captured sensors (``measured``), either of them behind a p
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mmsynth.data import data_folder
 from mmsynth.errors import InputError
@@ -23,6 +22,7 @@ from mmsynth.files import write_text
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.polarization import OffAxis
+from mmsynth.toml import read_toml
 
 _Positive = Annotated[float, Field(gt=0)]
 
@@ -221,18 +221,7 @@ def load_sensor(path: Path) -> SensorFile:
     Raises:
         InputError: unreadable file, broken TOML, an unknown key, or a value that cannot be.
     """
-    try:
-        return SensorFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror}).") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML ({error}).") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        said = first["msg"].removeprefix("Value error, ").rstrip(".")
-        # what a part says of itself begins with its name
-        raise InputError(f"{path}: {where}: {said}." if where and not said.startswith(f"{where}: ") else f"{path}: {said}.") from error
+    return read_toml(path, SensorFile)
 
 
 def sensor_to_toml(sensor: SensorFile, comments: tuple[str, ...] = ()) -> str:
