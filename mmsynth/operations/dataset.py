@@ -25,36 +25,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tifffile
 
 import mmsynth
 from mmsynth.errors import InputError
-from mmsynth.files import read_json, write_atomic, write_json
-from mmsynth.operations.convert import CONVENTIONS, camera_json, modality_arrays, sensor_json, sha256_of
+from mmsynth.files import read_json, sha256_of, write_json
 from mmsynth.operations.previews import preview_linear
 from mmsynth.operations.progress import Counter, Progress
+from mmsynth.operations.records import CONVENTIONS, FORMATS, UNITS, camera_json, field_hash, modality_arrays, sensor_json, write_record
 from mmsynth.operations.trajectories import View
-from mmsynth.scene.images import write_exr, write_npz, write_png16, write_tiff16
+from mmsynth.scene.images import write_png16
 from mmsynth.scene.poses import OPENGL_TO_OPENCV
-from mmsynth.scene.scene import Sensor, canonical_modality
+from mmsynth.scene.scene import canonical_modality
 from mmsynth.sensors.camera import Camera
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
 
 RIGS = ("aligned", "native")
-FORMATS = ("npz", "exr", "tiff")
-LAYOUT = 1
-
-
-def field_hash(field: Field) -> str:
-    """SHA-256 over the parameters and the rendering settings: two fields with one hash render the same."""
-    digest = hashlib.sha256(repr(getattr(field, "sampling", None)).encode())
-    for name, tensor in sorted(field.state_dict().items()):
-        value = tensor.detach().cpu().contiguous().numpy()
-        digest.update(f"{name} {value.dtype} {value.shape}".encode())
-        digest.update(value.tobytes())
-    return digest.hexdigest()
+LAYOUT = 2
 
 
 def generate_dataset(
@@ -156,11 +144,15 @@ def _render_view(field: Field, cameras: Placed, rig: str, folder: Path, format: 
         camera, pose = cameras[group[0]]
         rendering = field.render(camera, pose, group, geometry=True, progress=count)
         for name in group:
-            files |= _write_modality(folder, field.sensors[name], rendering, format)
-        files |= _write(folder, _of("geometry", group[0], rig), _geometry_arrays(rendering), format)
+            arrays = modality_arrays(rendering.channels[name], rendering.stokes.get(name))
+            files |= write_record(folder, name, arrays, format, UNITS, field.sensors[name])
+        units = UNITS | {"depth_z": field.unit, "depth_ray": field.unit}
+        files |= write_record(folder, _of("geometry", group[0], rig), _geometry_arrays(rendering), format, units)
         picture = folder / f"{_of('image', group[0], rig)}.png"
         write_png16(picture, preview_linear(field.sensors[group[0]], rendering.channels[group[0]]))
-        files[picture.name] = _entry(picture, {"image": (camera.height, camera.width, 3)}, "uint16")
+        shown = {"shape": [camera.height, camera.width, 3], "dtype": "uint16", "unit": "full scale"}
+        facts = {"sha256": sha256_of(picture), "bytes": picture.stat().st_size, "arrays": {"image": shown}}
+        files[picture.name] = {"record": picture.stem, **facts}
     return files
 
 
@@ -178,76 +170,6 @@ def _geometry_arrays(rendering: Rendering) -> dict[str, np.ndarray]:
         "mask": rendering.opacity > 0.5,
         "valid": rendering.valid,
     }
-
-
-def _entry(path: Path, shapes: Mapping[str, tuple[int, ...]], dtype: str | Mapping[str, str]) -> dict[str, Any]:
-    arrays = {k: {"shape": list(s), "dtype": dtype if isinstance(dtype, str) else dtype[k]} for k, s in shapes.items()}
-    return {"sha256": sha256_of(path), "bytes": path.stat().st_size, "arrays": arrays}
-
-
-def _write(folder: Path, stem: str, arrays: Mapping[str, np.ndarray], format: str) -> dict[str, Any]:
-    """Write named (H, W) or (H, W, K) arrays; images as float channels in EXR, as one float file each in TIFF."""
-    if format == "npz":
-        path = folder / f"{stem}.npz"
-        write_npz(path, arrays)
-        return {path.name: _entry(path, {k: a.shape for k, a in arrays.items()}, {k: str(a.dtype) for k, a in arrays.items()})}
-    if format == "exr":
-        path = folder / f"{stem}.exr"
-        channels = _exr_channels(arrays)
-        write_exr(path, channels)
-        return {path.name: _entry(path, {k: a.shape for k, a in channels.items()}, "float32")}
-    out: dict[str, Any] = {}
-    for key, array in arrays.items():
-        path = folder / f"{stem}_{key}.tiff"
-        _write_tiff_float(path, array)
-        out[path.name] = _entry(path, {key: array.shape}, "float32")
-    return out
-
-
-def _write_modality(folder: Path, sensor: Sensor, rendering: Rendering, format: str) -> dict[str, Any]:
-    arrays = modality_arrays(sensor, rendering.channels[sensor.name], rendering.stokes.get(sensor.name))
-    if format == "npz":
-        return _write(folder, sensor.name, arrays, format)
-    image, stokes = arrays["data"], arrays.get("stokes")
-    if format == "exr":
-        channels = {label: image[..., i] for i, label in enumerate(_labels(sensor))}
-        return _write(folder, sensor.name, channels | ({} if stokes is None else {"S": stokes}), format)
-    path = folder / f"{sensor.name}.tiff"
-    image = image[..., 0] if image.shape[2] == 1 else image
-    write_tiff16(path, image)
-    out = {path.name: _entry(path, {"data": image.shape}, "uint16")}
-    return out if stokes is None else out | _write(folder, sensor.name, {"stokes": stokes}, format)
-
-
-def _labels(sensor: Sensor) -> list[str]:
-    """Channel names that are unique and that EXR accepts; a dot would open a layer."""
-    labels = [c.replace(".", "_") or f"channel{i}" for i, c in enumerate(sensor.channels)]
-    return labels if len(set(labels)) == len(labels) else [f"{i}_{label}" for i, label in enumerate(labels)]
-
-
-_COMPONENTS = {"normal": ("X", "Y", "Z"), "S": ("0", "1", "2")}
-
-
-def _exr_channels(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """normal (H, W, 3) → normal.X normal.Y normal.Z; S (H, W, 3) → S.0 S.1 S.2; (H, W) keep their name."""
-    out = {}
-    for key, array in arrays.items():
-        if array.ndim == 2:
-            out[key] = array
-        else:
-            out |= {f"{key}.{part}": array[..., i] for i, part in enumerate(_COMPONENTS[key])}
-    return out
-
-
-def _write_tiff_float(path: Path, image: np.ndarray) -> None:
-    pixels = np.ascontiguousarray(image, np.float32)
-    planar = "contig" if pixels.ndim == 3 else None
-    write_atomic(
-        path,
-        lambda temporary: tifffile.imwrite(
-            temporary, pixels, photometric="minisblack", planarconfig=planar, compression="zlib", metadata=None
-        ),
-    )
 
 
 def _transforms(cameras: Sequence[tuple[Camera, np.ndarray]], picture: str) -> dict[str, Any]:
