@@ -146,6 +146,20 @@ def view_scores(field: Field, rays: TrainingRays, views: Sequence[View], progres
     return scores
 
 
+def covered_views(views: Sequence[View], scores: Sequence[float], least: float) -> tuple[list[View], list[tuple[str, float]]]:
+    """Views with a score of at least ``least``, and name and score of the others.
+
+    Raises:
+        InputError: no view has that score.
+    """
+    kept = [view for view, score in zip(views, scores, strict=True) if score >= least]
+    if not kept:
+        raise InputError(
+            f"coverage: the best of {len(views)} views has {max(scores, default=0.0):.3f}, expected one with {least:g} or more."
+        )
+    return kept, [(name, score) for (_, _, name), score in zip(views, scores, strict=True) if score < least]
+
+
 def _focal(camera: Camera) -> float:
     return float(np.sqrt(camera.fx * camera.fy))
 
@@ -182,7 +196,7 @@ def _best(rays: TrainingRays, points: np.ndarray, normals: np.ndarray, centre: n
         seen[at, rank] = _sees(rays, frames[at, rank], points[waiting[at]])
         best[waiting] = np.where(seen, worth, 0.0).max(1)
         waiting = waiting[~seen.any(1) & (worth[:, -1] > 0)]
-        start, size = start + size, 2 * size
+        start, size = start + size, 4 * size
     return best
 
 

@@ -13,7 +13,7 @@ from analytic import MONO, RGB, AnalyticField, Distance, meets_ball, sphere
 from conftest import look_at, ring
 
 from mmsynth.errors import InputError
-from mmsynth.operations.coverage import TrainingRays, coverage, resized, training_rays, view_score, view_scores
+from mmsynth.operations.coverage import TrainingRays, coverage, covered_views, resized, training_rays, view_score, view_scores
 from mmsynth.operations.visibility import surface_points
 from mmsynth.scene.scene import Frame, Region, Scene, Split
 from mmsynth.sensors.camera import Camera, project, unproject
@@ -184,6 +184,14 @@ def test_frames_of_all_or_some_modalities_count() -> None:
         training_rays(field, scene, ["ms"])
     with pytest.raises(InputError, match="no training frames of mono"):
         training_rays(field, scene_with([turned(0), turned(180)]), ["mono"])
+
+
+def test_covered_views() -> None:
+    views = [(LENS, turned(degrees), f"{degrees:04d}") for degrees in (0, 50, 180)]
+    assert covered_views(views, [1.0, 0.5, 0.0], 0.5) == (views[:2], [("0180", 0.0)])
+    assert covered_views(views, [1.0, 0.5, 0.0], 0.0) == (views, [])
+    with pytest.raises(InputError, match=r"the best of 3 views has 0\.400, expected one with 0\.5 or more"):
+        covered_views(views, [0.4, 0.1, 0.0], 0.5)
 
 
 def test_resized_camera_sees_the_same() -> None:
