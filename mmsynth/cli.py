@@ -311,13 +311,19 @@ def convert(
 @command("generate-dataset")
 def generate_dataset(
     poses: Annotated[
-        Path, typer.Option(help="transforms.json, camera_path.json, images.txt or a trajectory; sought here, then in the scene")
+        Path,
+        typer.Option(
+            help="transforms.json, camera_path.json, images.txt, meta_data.json, TUM or a trajectory; sought here, then in the scene"
+        ),
     ] = Path("poses.json"),
     run: RunOption = None,
     rig: Annotated[
         str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")
     ] = "aligned",
     modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
+    min_coverage: Annotated[
+        float | None, typer.Option(help="leave out views that the training frames cover less; 1 = their own pixels")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="default: RUN/dataset")] = None,
     file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
     verify: Annotated[bool, typer.Option("--verify", help="only check a finished dataset against its checksums")] = False,
@@ -325,8 +331,11 @@ def generate_dataset(
 ) -> None:
     """An aligned dataset: every modality, depth, normal, opacity, intrinsics and pose per view."""
     from mmsynth.operations import dataset
+    from mmsynth.operations.coverage import covered_views, training_rays, view_scores
     from mmsynth.operations.trajectories import load_views
 
+    if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
+        raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
     folder, field, scene = _load(run)
     destination = out or folder / "dataset"
     if verify:
@@ -336,9 +345,20 @@ def generate_dataset(
         print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")
         return
     views = load_views(_poses_file(poses, scene.root), field, scene)
+    left_out: list[tuple[str, float]] = []
+    if min_coverage is not None:
+        given = len(views)
+        with _bar("coverage", as_json) as show:
+            scores = view_scores(field, training_rays(field, scene, progress=show), views, progress=show)
+        views, left_out = covered_views(views, scores, min_coverage)
+        if left_out and not as_json:
+            named = ", ".join(f"{name} ({score:.2f})" for name, score in left_out)
+            print(f"left out {len(left_out)} of {given} views with a coverage below {min_coverage:g}: {named}")
     with _bar("dataset", as_json) as show:
         written = dataset.generate_dataset(field, views, destination, _names(modalities), rig, file_format, progress=show)
-    print(json.dumps({"dataset": str(written), "views": len(views)}) if as_json else f"wrote {len(views)} views into {destination}/")
+    unseen = [{"name": name, "coverage_score": score} for name, score in left_out]
+    facts = {"dataset": str(written), "views": len(views), "left_out": unseen}
+    print(json.dumps(facts) if as_json else f"wrote {len(views)} views into {destination}/")
 
 
 @command("simulate")

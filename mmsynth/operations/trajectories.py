@@ -27,7 +27,9 @@ View = tuple[Camera, np.ndarray, str]
 _KEYS: dict[str, dict[str, Any]] = {
     "orbit": {"views": 60, "elevation_deg": 25.0, "radius": None},
     "hemisphere": {"views": 60, "min_elevation_deg": 10.0, "radius": None},
+    "spiral": {"views": 60, "turns": 2.0, "min_elevation_deg": 10.0, "max_elevation_deg": 60.0, "radius": None},
     "interpolate": {"views": 60},
+    "perturb": {"per_pose": 2, "rotation_deg": 3.0, "translation": 0.05, "seed": 0},
 }
 
 
@@ -77,16 +79,48 @@ def _around(azimuth: np.ndarray, sine: np.ndarray, radius: float, region: Region
     return [look_at(centre + radius * o, centre, up) for o in offset]
 
 
-def _interpolate(views: int, poses: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Through all training poses in their order: rotations by SLERP, positions linear, equal time between neighbours."""
-    at = np.linspace(0.0, len(poses) - 1.0, views)
-    rotations = Slerp(np.arange(len(poses)), Rotation.from_matrix(np.array([p[:3, :3] for p in poses])))(at).as_matrix()
-    centres = np.array([p[:3, 3] for p in poses])
+def _interpolate(views: int, poses: Sequence[np.ndarray], reach: float) -> list[np.ndarray]:
+    """Through all training poses in their order: positions linear, rotations by SLERP, at constant speed.
+
+    The way between two poses is √(distance² + (reach · angle)²): a camera that turns on the spot moves what it sees, too. Poses that
+    repeat take no time.
+
+    Args:
+        reach: how far away things are, in the scene's unit: what an angle in radians counts for.
+    """
+    rotations, centres = Rotation.from_matrix(np.array([p[:3, :3] for p in poses])), np.array([p[:3, 3] for p in poses])
+    turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.linalg.norm(np.diff(centres, axis=0), axis=1), reach * turned))])
+    moved = np.concatenate([[True], np.diff(way) > 1e-9 * way[-1]])  # the rest is rounding
+    if moved.sum() == 1:
+        return [poses[0]] * views
+    at = np.linspace(0.0, way[moved][-1], views)
     out = np.tile(np.eye(4), (views, 1, 1))
-    out[:, :3, :3] = rotations
+    out[:, :3, :3] = Slerp(way[moved], rotations[moved])(at).as_matrix()
     for axis in range(3):
-        out[:, axis, 3] = np.interp(at, np.arange(len(poses)), centres[:, axis])
+        out[:, axis, 3] = np.interp(at, way[moved], centres[moved, axis])
     return list(out)
+
+
+def _perturb(
+    per_pose: int, rotation: float, translation: float, seed: int, region: Region, poses: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Cameras turned about and moved along their own axes by normal deviates: those of copy k of pose i depend on (seed, i, k) alone.
+
+    Args:
+        rotation: standard deviation of each component of the rotation vector [rad].
+        translation: of each coordinate, as a share of the pose's distance to the region's centre.
+    """
+    out = []
+    for index, pose in enumerate(poses):
+        distance = float(np.linalg.norm(pose[:3, 3] - region.centre))
+        for copy in range(per_pose):
+            deviates = np.random.default_rng([seed, index, copy]).standard_normal(6)
+            motion = np.eye(4)
+            motion[:3, :3] = Rotation.from_rotvec(rotation * deviates[:3]).as_matrix()
+            motion[:3, 3] = translation * distance * deviates[3:]
+            out.append(pose @ motion)
+    return out
 
 
 def _number(spec: Mapping[str, Any], key: str, default: float, low: float, high: float, where: str) -> float:
@@ -97,6 +131,13 @@ def _number(spec: Mapping[str, Any], key: str, default: float, low: float, high:
     return float(value)
 
 
+def _whole(spec: Mapping[str, Any], key: str, default: int, low: int, high: int, where: str) -> int:
+    value = _number(spec, key, default, low, high, where)
+    if value != int(value):
+        raise InputError(f"{where}: key '{key}' is {value}, expected a whole number.")
+    return int(value)
+
+
 def trajectory_views(
     spec: Mapping[str, Any], region: Region, camera: Camera, training: Sequence[np.ndarray], where: str = "trajectory"
 ) -> list[View]:
@@ -104,7 +145,12 @@ def trajectory_views(
 
     * ``{"trajectory": "orbit", "views": 60, "elevation_deg": 25, "radius": r}``: a circle, starting at the first training camera's side;
     * ``{"trajectory": "hemisphere", "views": 60, "min_elevation_deg": 10, "radius": r}``: a Fibonacci lattice, equal area per view;
-    * ``{"trajectory": "interpolate", "views": 60}``: through the training poses, rotations by SLERP.
+    * ``{"trajectory": "spiral", "views": 60, "turns": 2, "min_elevation_deg": 10, "max_elevation_deg": 60, "radius": r}``: rises
+      evenly from the one elevation to the other while it turns, both ends included;
+    * ``{"trajectory": "interpolate", "views": 60}``: through the training poses in their order, at constant speed, rotations by SLERP;
+    * ``{"trajectory": "perturb", "per_pose": 2, "rotation_deg": 3, "translation": 0.05, "seed": 0}``: copies of every training pose, each
+      turned and moved at random about its own axes; standard deviations per axis, of the translation as a share of the pose's distance to
+      the region's centre.
 
     Args:
         camera: intrinsics of every view. training: (4, 4) poses; give up direction, and the radius (median distance) when none is stated.
@@ -119,28 +165,39 @@ def trajectory_views(
     unknown = [key for key in spec if key != "trajectory" and key not in allowed]
     if unknown:
         raise InputError(f"{where}: unknown key '{unknown[0]}', expected one of {', '.join(allowed)} for '{kind}'.")
-    number = _number(spec, "views", allowed["views"], 1, 100_000, where)
-    if number != int(number):
-        raise InputError(f"{where}: key 'views' is {number}, expected a whole number.")
-    views = int(number)
+    read = lambda key, low, high: _number(spec, key, allowed[key], low, high, where)
+    distances = [float(np.linalg.norm(pose[:3, 3] - region.centre)) for pose in training]
+    reach = float(np.median(distances)) if distances and np.median(distances) > 0 else 3.0 * region.radius
+    if kind == "perturb":
+        if not training:
+            raise InputError(f"{where}: no training poses, expected at least 1 to perturb.")
+        per_pose, seed = _whole(spec, "per_pose", allowed["per_pose"], 1, 10_000, where), _whole(spec, "seed", 0, 0, 2**53, where)
+        rotation, translation = np.radians(read("rotation_deg", 0.0, 180.0)), read("translation", 0.0, 10.0)
+        poses = _perturb(per_pose, rotation, translation, seed, region, training)
+        return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
+    views = _whole(spec, "views", allowed["views"], 1, 100_000, where)
     if kind == "interpolate":
         if len(training) < 2:
             raise InputError(f"{where}: {len(training)} training poses, expected at least 2 to interpolate.")
-        poses = _interpolate(views, training)
+        poses = _interpolate(views, training, reach)
     else:
-        distances = [float(np.linalg.norm(pose[:3, 3] - region.centre)) for pose in training]
-        default = float(np.median(distances)) if distances and np.median(distances) > 0 else 3.0 * region.radius
-        radius = default if spec.get("radius") is None else _number(spec, "radius", default, 1e-9, 1e9, where)
+        radius = reach if spec.get("radius") is None else _number(spec, "radius", reach, 1e-9, 1e9, where)
+        steps = np.arange(views)
         if kind == "orbit":
-            elevation = np.radians(_number(spec, "elevation_deg", allowed["elevation_deg"], -90.0, 90.0, where))
-            azimuth = 2 * np.pi * np.arange(views) / views
-            poses = _around(azimuth, np.full(views, np.sin(elevation)), radius, region, training)
+            elevation = np.radians(read("elevation_deg", -90.0, 90.0))
+            azimuth, sine = 2 * np.pi * steps / views, np.full(views, np.sin(elevation))
+        elif kind == "spiral":
+            lowest, highest = read("min_elevation_deg", -90.0, 90.0), read("max_elevation_deg", -90.0, 90.0)
+            if lowest > highest:
+                raise InputError(f"{where}: key 'max_elevation_deg' is {highest:g}, expected at least 'min_elevation_deg', {lowest:g}.")
+            share = np.linspace(0.0, 1.0, views)
+            azimuth = 2 * np.pi * read("turns", -1000.0, 1000.0) * share
+            sine = np.sin(np.radians(lowest + (highest - lowest) * share))
         else:
-            lowest = np.sin(np.radians(_number(spec, "min_elevation_deg", allowed["min_elevation_deg"], -90.0, 89.0, where)))
-            steps = np.arange(views)
-            sine = lowest + (1.0 - lowest) * (steps + 0.5) / views
+            floor = np.sin(np.radians(read("min_elevation_deg", -90.0, 89.0)))
             golden_angle = np.pi * (3.0 - np.sqrt(5.0))
-            poses = _around(golden_angle * steps, sine, radius, region, training)
+            azimuth, sine = golden_angle * steps, floor + (1.0 - floor) * (steps + 0.5) / views
+        poses = _around(azimuth, sine, radius, region, training)
     return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
 
 

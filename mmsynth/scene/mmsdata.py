@@ -18,7 +18,7 @@ frame that ``worldtogt`` leads to, where it is not metres.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +61,11 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     """
     root = Path(root)
     path = root / "meta_data.json"
-    meta = read_json(path)
-    if not isinstance(meta, dict) or not isinstance(meta.get("modalities"), dict) or not meta["modalities"]:
-        raise InputError(f"{path}: key 'modalities' is missing or empty, expected an object with one entry per sensor.")
+    meta = _read_meta(path)
     raw, undistorted = _flag(meta, "raw", path), _flag(meta, "undistorted", path)
     to_output, scale, unit = _world_to_output(meta, path)
     unit = str(meta.get("unit", unit))
-    offset = number(meta, "pixel_offset", str(path)) if "pixel_offset" in meta else 0.0
+    offset = _pixel_offset(meta, path)
 
     sources = {source: canonical_modality(source) for source in meta["modalities"]}
     for name, count in Counter(sources.values()).items():
@@ -80,10 +78,8 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     for source, name in sources.items():
         if name not in wanted:
             continue
-        entry = meta["modalities"][source]
         where = f"{path}: modality '{source}'"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where} is not an object.")
+        entry = _modality(meta, source, where)
         camera = _camera(entry, where, undistorted, offset)
         present, missing = _frames(entry, where, root, source, name, camera, to_output, scale)
         if not present:
@@ -100,6 +96,24 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     centre = to_output[:3, 3]
     region = Region((float(centre[0]), float(centre[1]), float(centre[2])), scale * radius)
     return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
+
+
+def read_reference_poses(path: Path) -> list[tuple[Camera, np.ndarray, str]]:
+    """Poses of the reference sensor, the first modality of a ``meta_data.json``: by frame id, with or without image files.
+
+    Returns:
+        (camera, camera_to_world (4, 4) in the frame and unit of ``read_mmsdata``, stem of the file name).
+    Raises:
+        InputError: missing or wrong key, or a pose that is not finite and rigid.
+    """
+    meta = _read_meta(path)
+    source = next(iter(meta["modalities"]))
+    where = f"{path}: modality '{source}'"
+    entry = _modality(meta, source, where)
+    camera = _camera(entry, where, _flag(meta, "undistorted", path), _pixel_offset(meta, path))
+    to_output, scale, _ = _world_to_output(meta, path)
+    frames = sorted(_stated_frames(entry, where, to_output, scale), key=lambda frame: frame[0])
+    return [(camera, pose, Path(file_name).stem) for _, file_name, pose in frames]
 
 
 def meta_content(
@@ -234,6 +248,24 @@ def _pattern(given: Any, where: str) -> np.ndarray:
     return pattern.astype(np.int64)
 
 
+def _read_meta(path: Path) -> dict[str, Any]:
+    meta = read_json(path)
+    if not isinstance(meta, dict) or not isinstance(meta.get("modalities"), dict) or not meta["modalities"]:
+        raise InputError(f"{path}: key 'modalities' is missing or empty, expected an object with one entry per sensor.")
+    return meta
+
+
+def _modality(meta: Mapping[str, Any], source: str, where: str) -> dict[str, Any]:
+    entry = meta["modalities"][source]
+    if not isinstance(entry, dict):
+        raise InputError(f"{where} is not an object.")
+    return entry
+
+
+def _pixel_offset(meta: Mapping[str, Any], path: Path) -> float:
+    return number(meta, "pixel_offset", str(path)) if "pixel_offset" in meta else 0.0
+
+
 def _flag(meta: Mapping[str, Any], key: str, path: Path) -> bool:
     if not isinstance(meta.get(key), bool):
         raise InputError(f"{path}: key '{key}' is {meta.get(key, 'missing')!r}, expected true or false.")
@@ -292,6 +324,18 @@ def _frames(
     """Frames with an image file, by view, and the count of those without."""
     present: dict[int, Frame] = {}
     missing = 0
+    for view, file_name, pose in _stated_frames(entry, where, to_output, scale):
+        path = root / "modalities" / source / file_name
+        if not path.is_file():
+            missing += 1
+            continue
+        mask = root / "masks" / source / f"{view:04d}.png"
+        present[view] = Frame(name, view, path, camera, pose, source, mask if mask.is_file() else None)
+    return [present[view] for view in sorted(present)], missing
+
+
+def _stated_frames(entry: Mapping[str, Any], where: str, to_output: np.ndarray, scale: float) -> Iterator[tuple[int, str, np.ndarray]]:
+    """View id, file name and camera_to_world (4, 4) of what a modality lists, in its order; poses in the frame of the Scene."""
     seen: set[int] = set()
     for index, item in enumerate(_frame_entries(entry, where)):
         view = whole(item, "frame_id", f"{where}, frame entry {index}")
@@ -303,13 +347,7 @@ def _frames(
             raise InputError(f"{here}: key 'file_name' is {item.get('file_name', 'missing')!r}, expected the name of an image file.")
         pose = rigid(item.get("camtoworld"), here) @ OPENGL_TO_OPENCV
         pose[:3, 3] *= scale  # then the rigid part: together s R x + t
-        path = root / "modalities" / source / item["file_name"]
-        if not path.is_file():
-            missing += 1
-            continue
-        mask = root / "masks" / source / f"{view:04d}.png"
-        present[view] = Frame(name, view, path, camera, to_output @ pose, source, mask if mask.is_file() else None)
-    return [present[view] for view in sorted(present)], missing
+        yield view, item["file_name"], to_output @ pose
 
 
 def _frame_entries(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:

@@ -242,9 +242,16 @@ def make_camera(
 def read_poses(path: Path) -> list[Pose]:
     """Read the poses to render from, in file order.
 
-    Accepted: nerfstudio ``transforms.json`` (OpenGL axes); nerfstudio ``camera_path.json`` (OpenGL axes, vertical field of
-    view in degrees; its poses are taken to be in the scene's frame); COLMAP ``images.txt`` (with ``cameras.txt`` beside it
-    if there), or a folder that holds it; ``{"convention": "OpenCV ...", "rig": [4x4, ...]}`` (OpenCV axes).
+    Accepted:
+
+    * nerfstudio ``transforms.json`` (OpenGL axes);
+    * nerfstudio ``camera_path.json`` (OpenGL axes, vertical field of view in degrees, square pixels, no distortion; its poses are
+      taken to be in the scene's frame);
+    * MMS-DATA ``meta_data.json``: the poses of its first modality, in the frame and unit in which the scene is read;
+    * COLMAP ``images.txt`` (with ``cameras.txt`` beside it if there), or a folder that holds it;
+    * TUM, ``.tum`` or ``.txt``: lines ``t tx ty tz qx qy qz qw``, camera to world, OpenCV axes; no intrinsics. The name of a pose is
+      its time as the file spells it. A ``.txt`` of another name than ``images.txt`` is TUM when its first line has at most eight values;
+    * ``{"convention": "OpenCV ...", "rig": [4x4, ...]}`` (OpenCV axes).
 
     Raises:
         InputError: missing or unknown file, no pose in it, or a pose that is not finite and rigid.
@@ -252,20 +259,27 @@ def read_poses(path: Path) -> list[Pose]:
     path = Path(path)
     if path.is_dir():
         path = path / "images.txt"
-    if path.suffix.lower() == ".txt":
+    if _is_tum(path):
+        poses = _read_tum(path)
+    elif path.suffix.lower() == ".txt":
         poses = _read_colmap(path)
     else:
         content = read_json(path)
         if not isinstance(content, dict):
-            raise InputError(f"{path}: a JSON {type(content).__name__}, expected an object with 'frames', 'camera_path' or 'rig'.")
+            kind = type(content).__name__
+            raise InputError(f"{path}: a JSON {kind}, expected an object with 'frames', 'camera_path', 'modalities' or 'rig'.")
         if "frames" in content:
             poses = _read_transforms(content, path)
         elif "camera_path" in content:
             poses = _read_camera_path(content, path)
+        elif "modalities" in content:
+            from mmsynth.scene.mmsdata import read_reference_poses  # which is built on this module
+
+            poses = [*read_reference_poses(path)]
         elif "rig" in content:
             poses = _read_rig(content, path)
         else:
-            raise InputError(f"{path}: none of the keys 'frames' (transforms.json), 'camera_path' or 'rig' found.")
+            raise InputError(f"{path}: none of the keys 'frames' (transforms.json), 'camera_path', 'modalities' (MMS-DATA) or 'rig' found.")
     if not poses:
         raise InputError(f"{path}: no poses in it, expected at least one.")
     return poses
@@ -326,8 +340,60 @@ def _read_rig(content: Mapping[str, Any], path: Path) -> list[Pose]:
     return [(None, rigid(matrix, f"{path}: pose {index}"), f"{index:04d}") for index, matrix in enumerate(content["rig"])]
 
 
+# --- TUM trajectories -------------------------------------------------------------------------------------------------
+
+_TUM_LINE = "t tx ty tz qx qy qz qw"
+
+
+def _is_tum(path: Path) -> bool:
+    """By its name, else by its first line: images of COLMAP have ten values or more."""
+    if path.suffix.lower() == ".tum":
+        return True
+    if path.suffix.lower() != ".txt" or path.name.lower() == "images.txt":
+        return False
+    content = (line.split() for line in text_lines(path))
+    return len(next((tokens for tokens in content if tokens and not tokens[0].startswith("#")), [])) <= 8
+
+
+def _read_tum(path: Path) -> list[Pose]:
+    out: list[Pose] = []
+    for row, line in enumerate(text_lines(path), 1):
+        tokens = line.split()
+        if not tokens or line.lstrip().startswith("#"):
+            continue
+        where = f"{path}: line {row}"
+        if len(tokens) != 8:
+            raise InputError(f"{where}: {len(tokens)} values, expected '{_TUM_LINE}'.")
+        values = _floats(tokens, where, _TUM_LINE)
+        pose = np.eye(4)
+        pose[:3, :3] = _rotation(_unit(values[[7, 4, 5, 6]], where))
+        pose[:3, 3] = values[1:4]
+        out.append((None, pose, tokens[0]))
+    return out
+
+
+def _floats(tokens: Sequence[str], where: str, line: str) -> np.ndarray:
+    """Finite numbers of a text line, or an InputError that says what the line should hold."""
+    try:
+        values = np.array([float(token) for token in tokens])
+    except ValueError as error:
+        raise InputError(f"{where}: not a number, expected '{line}'.") from error
+    if not np.isfinite(values).all():
+        raise InputError(f"{where}: a value is not finite, expected '{line}'.")
+    return values
+
+
+def _unit(quaternion: np.ndarray, where: str) -> np.ndarray:
+    """A unit quaternion without the rounding of its decimals."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 1e-3:
+        raise InputError(f"{where}: the quaternion has the length {norm:.4g}, expected a unit quaternion.")
+    return quaternion / norm
+
+
 # --- COLMAP text model -----------------------------------------------------------------------------------------------
 
+_COLMAP_LINE = "id qw qx qy qz tx ty tz camera name"
 # what each parameter of a COLMAP camera model is, in file order
 _COLMAP_MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -356,19 +422,15 @@ def _read_colmap(path: Path) -> list[Pose]:
             continue
         where = f"{path}: line {row}"
         if len(tokens) < 10:
-            raise InputError(f"{where}: {len(tokens)} values, expected 'id qw qx qy qz tx ty tz camera name'.")
-        try:
-            values = np.array([float(token) for token in tokens[1:8]])
-            camera_id = int(tokens[8])
-        except ValueError as error:
-            raise InputError(f"{where}: not a number, expected 'id qw qx qy qz tx ty tz camera name'.") from error
-        norm = float(np.linalg.norm(values[:4]))
-        if not np.isfinite(values).all() or abs(norm - 1) > 1e-3:
-            raise InputError(f"{where}: the quaternion has length {norm:.4g} or a value is not finite, expected a unit quaternion.")
+            raise InputError(f"{where}: {len(tokens)} values, expected '{_COLMAP_LINE}'.")
+        values = _floats(tokens[1:8], where, _COLMAP_LINE)
+        if not tokens[8].isdecimal():
+            raise InputError(f"{where}: camera {tokens[8]} is not a whole number, expected '{_COLMAP_LINE}'.")
+        camera_id = int(tokens[8])
         if cameras is not None and camera_id not in cameras:
             raise InputError(f"{where}: camera {camera_id} is not in {path.with_name('cameras.txt')}.")
         camera_to_world = np.eye(4)
-        camera_to_world[:3, :3] = _rotation(values[:4] / norm).T
+        camera_to_world[:3, :3] = _rotation(_unit(values[:4], where)).T
         camera_to_world[:3, 3] = -camera_to_world[:3, :3] @ values[4:7]
         out.append((cameras[camera_id] if cameras is not None else None, camera_to_world, Path(" ".join(tokens[9:])).stem))
         points_expected = True

@@ -134,6 +134,25 @@ def test_generate_dataset_resumes_and_verifies(fitted: Path) -> None:
     refused(run(fitted, "generate-dataset", "--poses", "poses.json", "--verify"), "problem")
 
 
+def test_generate_dataset_leaves_out_what_no_frame_saw(fitted: Path, tmp_path: Path) -> None:
+    """Two of the example scene's poses, and one that looks away from the scene."""
+    content = json.loads((data_folder("example_scene") / "poses.json").read_text())
+    frames = content["frames"][:2]
+    away = (np.array(frames[0]["transform_matrix"]) @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()
+    content["frames"] = [*frames, {**frames[0], "file_path": "away.png", "transform_matrix": away}]
+    (fitted / "three.json").write_text(json.dumps(content))
+    args = ("generate-dataset", "--poses", "three.json", "--modalities", "rgb", "--out", str(tmp_path / "out"))
+    result = run(fitted, *args, "--min-coverage", "0.3")
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("left out 1 of 3 views with a coverage below 0.3: away (0.") and lines[1].startswith("wrote 2 views")
+    assert len(json.loads((tmp_path / "out/dataset.json").read_text())["views"]) == 2
+    facts = json.loads(run(fitted, *args, "--min-coverage", "0.3", "--json").stdout)
+    assert facts["views"] == 2 and facts["left_out"][0]["name"] == "away" and facts["left_out"][0]["coverage_score"] < 0.3
+    refused(run(fitted, *args, "--min-coverage", "30"), "--min-coverage 30", "from 0 to 1")
+    refused(run(fitted, *args, "--min-coverage", "1"), "the best of 3 views")
+
+
 MONO_TOML = """name = "nir"
 instance_of = "nir"
 [noise]

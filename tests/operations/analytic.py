@@ -38,6 +38,13 @@ def torus(major: float = 0.5, minor: float = 0.2) -> Distance:
     return lambda p: np.hypot(np.hypot(p[..., 0], p[..., 1]) - major, p[..., 2]) - minor
 
 
+def meets_ball(points: np.ndarray, eye: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Whether the straight way from each point (..., 3) to the eye leads through a ball."""
+    way = eye - points
+    nearest = np.clip(np.sum((centre - points) * way, -1) / np.sum(way * way, -1), 0.0, 1.0)
+    return np.linalg.norm(points + nearest[..., None] * way - centre, axis=-1) < radius
+
+
 class AnalyticField:
     """Lambertian-like surface under a fixed light; polarization axis along the projected normal, DoLP 0.3."""
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from analytic import RGB, AnalyticField, ring_pose, scene_of, sphere
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
 
 from mmsynth.errors import InputError
 from mmsynth.operations.trajectories import load_views, look_at, trajectory_views, world_up
@@ -58,11 +61,79 @@ def test_hemisphere_is_even() -> None:
     assert distance.min(1).min() > 0.6 * distance.min(1).max()
 
 
+def test_spiral() -> None:
+    spec = {"trajectory": "spiral", "views": 9, "turns": 2, "min_elevation_deg": -10, "max_elevation_deg": 70, "radius": 2}
+    views = trajectory_views(spec, REGION, CAMERA, TRAINING)
+    offsets = np.array([p[:3, 3] - REGION.centre for _, p, _ in views])
+    elevation = np.radians(np.arange(-10, 71, 10))
+    turn = np.pi / 2 * np.arange(9)  # two turns in eight steps, from the first training camera's side
+    expected = 2 * np.stack([np.cos(elevation) * np.cos(turn), np.cos(elevation) * np.sin(turn), np.sin(elevation)], 1)
+    np.testing.assert_allclose(offsets, expected, atol=1e-9)
+    for (_, pose, _), offset in zip(views, offsets, strict=True):
+        assert is_rigid(pose) and pose[:3, 2] == pytest.approx(-offset / 2)
+
+
 def test_interpolate_meets_the_training_poses() -> None:
     views = trajectory_views({"trajectory": "interpolate", "views": 15}, REGION, CAMERA, TRAINING)
     assert all(is_rigid(p) for _, p, _ in views)
     for i, pose in enumerate(TRAINING):
         assert np.allclose(views[2 * i][1], pose)
+
+
+def test_interpolate_at_constant_speed() -> None:
+    """Gaps of 1 and 3 units; then a turn on the spot by 0.5 rad, seen from 4 units away, is a way of 2."""
+    centre = np.array(REGION.centre)
+    poses = [np.eye(4), np.eye(4), np.eye(4), np.eye(4)]
+    for pose, x in zip(poses, (-1.0, 0.0, 3.0, 3.0), strict=True):
+        pose[:3, 3] = centre + [x, 0.0, -np.sqrt(16 - x * x)]  # all as far from the centre as the reach
+    chords = [np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in pairwise(poses)]
+    poses[3][:3, :3] = Rotation.from_euler("y", 0.5).as_matrix()
+    views = [p for _, p, _ in trajectory_views({"trajectory": "interpolate", "views": 200}, REGION, CAMERA, poses)]
+    way = np.array(
+        [
+            np.hypot(np.linalg.norm(b[:3, 3] - a[:3, 3]), 4 * Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
+            for a, b in pairwise(views)
+        ]
+    )
+    inner = np.sort(way)[2:]  # but for the two steps that cut a corner
+    assert inner == pytest.approx(np.full(197, (sum(chords) + 2.0) / 199), rel=1e-6)
+    np.testing.assert_allclose(views[-1], poses[3], atol=1e-12)
+
+
+@pytest.mark.parametrize("repeated", [[0, 0, 1, 2, 2, 2, 3], [0, 1, 1, 2, 3, 3]])
+def test_interpolate_does_not_dwell_on_repeated_poses(repeated: list[int]) -> None:
+    spec = {"trajectory": "interpolate", "views": 13}
+    once = trajectory_views(spec, REGION, CAMERA, TRAINING[:4])
+    again = trajectory_views(spec, REGION, CAMERA, [TRAINING[i] for i in repeated])
+    np.testing.assert_allclose([p for _, p, _ in again], [p for _, p, _ in once], atol=1e-9)
+
+
+def test_interpolate_between_equal_poses_stays() -> None:
+    views = trajectory_views({"trajectory": "interpolate", "views": 5}, REGION, CAMERA, [TRAINING[0]] * 3)
+    assert len(views) == 5 and all(np.array_equal(p, TRAINING[0]) for _, p, _ in views)
+
+
+def perturbed(**keys: Any) -> np.ndarray:
+    return np.array([p for _, p, _ in trajectory_views({"trajectory": "perturb", **keys}, REGION, CAMERA, TRAINING)])
+
+
+def test_perturb_has_the_stated_spread() -> None:
+    """Motions in the cameras' own axes: normal, of the stated standard deviation, independent of each other."""
+    poses = perturbed(per_pose=500, rotation_deg=2, translation=0.03, seed=7)
+    motion = np.linalg.inv(np.repeat(TRAINING, 500, axis=0)) @ poses
+    turns = np.degrees(Rotation.from_matrix(motion[:, :3, :3]).as_rotvec()) / 2
+    shifts = motion[:, :3, 3] / (0.03 * np.linalg.norm([2.2, 1.0]))  # the training cameras' distance to the centre
+    deviates = np.concatenate([turns, shifts], 1)
+    for column in deviates.T:
+        assert kstest(column, "norm").pvalue > 1e-3
+    np.testing.assert_allclose(np.cov(deviates.T), np.eye(6), atol=0.08)
+
+
+def test_perturb_is_a_function_of_seed_and_index() -> None:
+    four, two = perturbed(per_pose=4, seed=3), perturbed(per_pose=2, seed=3)
+    assert np.array_equal(four.reshape(8, 4, 4, 4)[:, :2], two.reshape(8, 2, 4, 4))
+    assert not np.isclose(perturbed(per_pose=2, seed=4), two)[:, :3].all((1, 2)).any()
+    np.testing.assert_allclose(perturbed(per_pose=1, rotation_deg=0, translation=0), TRAINING, atol=1e-15)
 
 
 def test_up_where_cameras_disagree() -> None:
@@ -84,7 +155,7 @@ def test_look_along_up() -> None:
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ({"trajectory": "spiral"}, "expected one of orbit, hemisphere, interpolate"),
+        ({"trajectory": "zigzag"}, "expected one of orbit, hemisphere, spiral, interpolate, perturb"),
         ({"trajectory": ["orbit"]}, "expected one of orbit"),
         ({}, "key 'trajectory' is None"),
         ({"trajectory": "orbit", "elevation": 3}, "unknown key 'elevation'"),
@@ -95,11 +166,24 @@ def test_look_along_up() -> None:
         ({"trajectory": "orbit", "radius": -1}, "key 'radius' is -1"),
         ({"trajectory": "orbit", "radius": float("nan")}, "key 'radius' is nan"),
         ({"trajectory": "hemisphere", "min_elevation_deg": "low"}, "key 'min_elevation_deg' is 'low'"),
+        ({"trajectory": "spiral", "min_elevation_deg": 70}, "key 'max_elevation_deg' is 60, expected at least 'min_elevation_deg', 70"),
+        ({"trajectory": "spiral", "turns": float("inf")}, "key 'turns' is inf"),
+        ({"trajectory": "spiral", "per_pose": 2}, "unknown key 'per_pose'"),
+        ({"trajectory": "perturb", "views": 2}, "unknown key 'views', expected one of per_pose, rotation_deg, translation, seed"),
+        ({"trajectory": "perturb", "per_pose": 0}, "key 'per_pose' is 0"),
+        ({"trajectory": "perturb", "seed": 1.5}, "key 'seed' is 1.5, expected a whole number"),
+        ({"trajectory": "perturb", "rotation_deg": -1}, "key 'rotation_deg' is -1"),
+        ({"trajectory": "perturb", "translation": None}, "key 'translation' is None"),
     ],
 )
 def test_refuses(spec: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         trajectory_views(spec, REGION, CAMERA, TRAINING)
+
+
+def test_perturb_needs_training_poses() -> None:
+    with pytest.raises(InputError, match="no training poses, expected at least 1 to perturb"):
+        trajectory_views({"trajectory": "perturb"}, REGION, CAMERA, [])
 
 
 def test_load_views(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import OPENCV_TO_OPENGL, look_at, ring
+from scipy.spatial.transform import Rotation
 
 from mmsynth.errors import InputError
+from mmsynth.scene.load import load_scene
 from mmsynth.scene.poses import read_poses, region_from_cameras, region_from_points, rigid
-from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.camera import Camera, project
 
 CAMERA = Camera(24, 18, 25.0, 25.0, 11.5, 8.5)
 
@@ -84,6 +87,86 @@ def test_another_colmap_camera_is_refused(tmp_path: Path) -> None:
         read_poses(tmp_path)
 
 
+def tum_line(pose: np.ndarray, time: str) -> str:
+    numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]  # SciPy's order is TUM's: x y z w
+    return " ".join([time, *(repr(float(n)) for n in numbers)])
+
+
+@pytest.mark.parametrize("name", ["groundtruth.txt", "path.tum"])
+def test_tum(tmp_path: Path, name: str) -> None:
+    poses = ring(3)
+    lines = ["# ground truth", "# timestamp tx ty tz qx qy qz qw", *(tum_line(p, f"1305031102.{i}75") for i, p in enumerate(poses)), ""]
+    (tmp_path / name).write_text("\n".join(lines))
+    found = read_poses(tmp_path / name)
+    assert [n for _, _, n in found] == ["1305031102.075", "1305031102.175", "1305031102.275"]
+    for (camera, pose, _), expected in zip(found, poses, strict=True):
+        assert camera is None
+        np.testing.assert_allclose(pose, expected, atol=1e-12)
+
+
+def test_colmap_under_another_name_is_not_tum(tmp_path: Path) -> None:
+    path = write_colmap(tmp_path, ring(2)).rename(tmp_path / "poses.txt")
+    for (_, pose, _), expected in zip(read_poses(path), ring(2), strict=True):
+        np.testing.assert_allclose(pose, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 0 0 0 0 0 1", "7 values, expected 't tx ty tz qx qy qz qw'"),
+        ("1 0 0 0 0 0 0 x", "not a number, expected 't tx"),
+        ("1 0 inf 0 0 0 0 1", "not finite"),
+        ("1 0 0 0 0 0 0 0.5", "the quaternion has the length 0.5, expected a unit quaternion"),
+    ],
+)
+def test_tum_errors_name_the_line(tmp_path: Path, line: str, message: str) -> None:
+    (tmp_path / "a.txt").write_text(f"# comment\n\n{line}\n")
+    with pytest.raises(InputError, match=rf"a\.txt: line 3: .*{message}"):
+        read_poses(tmp_path / "a.txt")
+
+
+def test_tum_without_poses_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_text("# nothing yet\n")
+    with pytest.raises(InputError, match=r"a\.tum: no poses in it"):
+        read_poses(tmp_path / "a.tum")
+
+
+def test_mmsdata_poses_are_those_of_the_scene(write_mmsdata: Callable[..., Path]) -> None:
+    root = write_mmsdata((0, 2, 7))
+    scene = load_scene(root)
+    found = read_poses(root / "meta_data.json")
+    assert [name for _, _, name in found] == ["0000", "0002", "0007"]
+    for (camera, pose, _), frame in zip(found, scene.frames_of("rgb"), strict=True):
+        assert camera == frame.camera
+        np.testing.assert_allclose(pose, frame.camera_to_world, atol=1e-15)
+
+
+def test_mmsdata_poses_need_no_images(write_mmsdata: Callable[..., Path]) -> None:
+    root = write_mmsdata(range(3), lambda meta: meta["modalities"]["rgb"]["frames"].reverse())
+    shutil.rmtree(root / "modalities")
+    poses = [pose for _, pose, _ in read_poses(root / "meta_data.json")]
+    # by frame id, turned by a quarter about z, scaled and moved to metres, as worldtogt says
+    to_metres = np.array([[0.0, -0.25, 0.0, 0.1], [0.25, 0.0, 0.0, 0.2], [0.0, 0.0, 0.25, 0.3]])
+    np.testing.assert_allclose([p[:3, 3] for p in poses], [to_metres @ p[:, 3] for p in ring(3)], atol=1e-12)
+
+
+def spoil_pose(meta: dict[str, Any]) -> None:
+    meta["modalities"]["rgb"]["frames"][1]["camtoworld"][0][0] = 3.0
+
+
+def spoil_camera(meta: dict[str, Any]) -> None:
+    del meta["modalities"]["rgb"]["fx"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [(spoil_pose, "modality 'rgb', frame 1: the pose is not rigid"), (spoil_camera, "modality 'rgb': key 'fx' is missing")],
+)
+def test_mmsdata_poses_errors(write_mmsdata: Callable[..., Path], spoil: Callable[[dict[str, Any]], None], message: str) -> None:
+    with pytest.raises(InputError, match=rf"meta_data\.json: {message}"):
+        read_poses(write_mmsdata(range(2), spoil) / "meta_data.json")
+
+
 def write_json(tmp_path: Path, content: Any) -> Path:
     (tmp_path / "poses.json").write_text(json.dumps(content))
     return tmp_path / "poses.json"
@@ -106,6 +189,15 @@ def test_camera_path(tmp_path: Path) -> None:
     camera, pose, _ = read_poses(write_json(tmp_path, content))[1]
     assert camera is not None and camera.fx == camera.fy == pytest.approx(25.0) and (camera.cx, camera.cy) == (11.5, 8.5)
     np.testing.assert_allclose(pose, ring(2)[1], atol=1e-12)
+    # the upper edge of the frame is half a field of view above the axis, wide frames or not
+    for width in (24, 60):
+        camera = read_poses(write_json(tmp_path, content | {"render_width": width}))[0][0]
+        assert camera is not None
+        up = np.radians(fov / 2)
+        across = np.tan(up) * width / 18
+        edge = project(np.array([[0.0, -np.sin(up), np.cos(up)], [across, 0.0, 1.0]]), camera)
+        np.testing.assert_allclose(edge, [[width / 2 - 0.5, -0.5], [width - 0.5, 8.5]], atol=1e-9)
+        assert camera.distortion == ()
     content["camera_type"] = "equirectangular"
     with pytest.raises(InputError, match="equirectangular"):
         read_poses(write_json(tmp_path, content))
