@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
     from mmsynth.fitting.trainer import fit
+    from mmsynth.operations.aligned_dataset import AlignedDataset
     from mmsynth.operations.calibrate_noise import calibrate_noise
     from mmsynth.operations.conversion import convert
     from mmsynth.operations.dataset import generate_dataset
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from mmsynth.sensors.twin import SensorTwin
 
 _HOMES = {
+    "AlignedDataset": "operations.aligned_dataset",
     "InputError": "errors",
     "Field": "field.field",
     "Rendering": "field.field",
@@ -47,6 +49,7 @@ _HOMES = {
     "simulate": "operations.simulate",
 }
 __all__ = [
+    "AlignedDataset",
     "Field",
     "InputError",
     "Recipe",

@@ -330,7 +330,7 @@ def generate_dataset(
     as_json: JsonOption = False,
 ) -> None:
     """An aligned dataset: every modality, depth, normal, opacity, intrinsics and pose per view."""
-    from mmsynth.operations import dataset
+    from mmsynth.operations import dataset, dataset_index
     from mmsynth.operations.coverage import covered_views, training_rays, view_scores
     from mmsynth.operations.trajectories import load_views
 
@@ -339,7 +339,7 @@ def generate_dataset(
     folder, field, scene = _load(run)
     destination = out or folder / "dataset"
     if verify:
-        problems = dataset.verify(destination)
+        problems = dataset_index.verify(destination)
         if problems:
             raise InputError(f"{destination}: {len(problems)} problems, first: {problems[0]}")
         print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")

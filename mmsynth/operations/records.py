@@ -14,14 +14,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import sha256_of
 from mmsynth.operations.previews import preview_linear
-from mmsynth.scene.images import read_exr, read_image, write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.images import read_exr, read_native, write_exr, write_npz, write_tiff, write_tiff16
 from mmsynth.scene.scene import Sensor
 from mmsynth.sensors.camera import Camera
 
@@ -160,8 +160,13 @@ def read_record(folder: Path, files: Mapping[str, Mapping[str, Any]], record: st
             names = facts.get("channels", [key])
             if planes and any(channel not in planes for channel in names):
                 raise InputError(f"{path}: no '{key}' in it, expected {', '.join(names)}.")
-            array = read_image(path) if not planes else planes[key] if "channels" not in facts else np.stack([planes[n] for n in names], -1)
-            out[key] = array.reshape(facts["shape"]).astype("float32" if facts["dtype"] == "uint16" else facts["dtype"])
+            if not planes:
+                array = read_native(path)
+            else:
+                array = planes[key] if "channels" not in facts else np.stack([planes[n] for n in names], -1)
+            array = array.reshape(facts["shape"])
+            # 16 bits are the share of full scale
+            out[key] = array / np.float32(65535) if facts["dtype"] == "uint16" else array.astype(facts["dtype"])
     if not out:
         raise InputError(f"{folder}: no record '{record}', expected one of {', '.join(sorted({f['record'] for f in files.values()}))}.")
     return out
@@ -170,17 +175,18 @@ def read_record(folder: Path, files: Mapping[str, Mapping[str, Any]], record: st
 _LAYOUT = {"spectralLayoutVersion": "1.0", "emissiveUnits": "DN (1 = full scale)", "polarisationHandedness": "right"}
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz file.
+def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndarray]:
+    """All arrays of an npz file; name: for errors.
 
     Raises:
         InputError: missing or damaged.
     """
     try:
-        with np.load(path) as arrays:
+        with np.load(file) as arrays:
             return {key: arrays[key] for key in arrays.files}
     except Exception as error:  # zipfile, zlib and numpy each have their own
-        raise InputError(f"{path}: damaged or missing, could not be read ({str(error).splitlines()[0]}).") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{name or file}: damaged or missing, could not be read ({reason}).") from error
 
 
 def _labels_of(sensor: Sensor | None) -> dict[str, np.ndarray]:
