@@ -138,20 +138,20 @@ def _bar(title: str, quiet: bool) -> Iterator[Callable[..., None]]:
         yield lambda done, total, news="": progress.update(task, completed=done, total=total, news=news)
 
 
-def _load_field(run: Path | None) -> tuple[Path, Any]:
+def _load_field(run: Path | None, device: str = "cpu") -> tuple[Path, Any]:
     """Run folder and its field."""
     from mmsynth.field.field import Field
     from mmsynth.runs import chosen_run
 
     path = chosen_run(run)
-    return path, Field.load(path)
+    return path, Field.load(path, device)
 
 
-def _load(run: Path | None) -> tuple[Path, Any, Any]:
+def _load(run: Path | None, device: str = "cpu") -> tuple[Path, Any, Any]:
     """Run folder, field, and the scene it was fitted to."""
     from mmsynth.scene.load import load_scene
 
-    path, field = _load_field(run)
+    path, field = _load_field(run, device)
     return path, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))
 
 
@@ -321,22 +321,37 @@ def generate_dataset(
         str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")
     ] = "aligned",
     modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
+    outputs: Annotated[
+        str | None, typer.Option(help="beside the modalities: some of geometry,flow,coverage, or none; default: all", metavar="NAMES")
+    ] = None,
     min_coverage: Annotated[
         float | None, typer.Option(help="leave out views that the training frames cover less; 1 = their own pixels")
     ] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="also raw frames of this sensor file or packaged sensor, once per sensor; into OUT/raw")
+    ] = None,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="also raw frames of the field's own sensors, as calibrate-noise found them (RUN/sensors)")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="of the raw frames' noise")] = 0,
     out: Annotated[Path | None, typer.Option(help="default: RUN/dataset")] = None,
-    file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr, tiff, webdataset or mms-data")] = "npz",
+    device: DeviceOption = "auto",
     verify: Annotated[bool, typer.Option("--verify", help="only check a finished dataset against its checksums")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """An aligned dataset: every modality, depth, normal, opacity, intrinsics and pose per view."""
+    """An aligned dataset: every modality, depth, normals, opacity, coverage, flow, intrinsics and pose per view. Under torchrun every
+    process makes its share."""
+    from mmsynth.fitting.trainer import pick_device
     from mmsynth.operations import dataset, dataset_index
     from mmsynth.operations.coverage import covered_views, training_rays, view_scores
+    from mmsynth.operations.share import local_device, share_of_environment
     from mmsynth.operations.trajectories import load_views
 
     if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
         raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
-    folder, field, scene = _load(run)
+    share = share_of_environment()
+    folder, field, scene = _load(run, local_device(pick_device(device)))
     destination = out or folder / "dataset"
     if verify:
         problems = dataset_index.verify(destination)
@@ -345,20 +360,72 @@ def generate_dataset(
         print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")
         return
     views = load_views(_poses_file(poses, scene.root), field, scene)
+    names = _names(modalities)
+    wanted = None if outputs is None else [] if outputs == "none" else [name.strip() for name in outputs.split(",")]
+    sensors = [*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)]
+    rays = None
+    if min_coverage is not None or wanted is None or "coverage" in wanted:
+        with _bar("training rays", as_json) as show:
+            rays = training_rays(field, scene, progress=show)
     left_out: list[tuple[str, float]] = []
     if min_coverage is not None:
         given = len(views)
+        assert rays is not None
         with _bar("coverage", as_json) as show:
-            scores = view_scores(field, training_rays(field, scene, progress=show), views, progress=show)
+            scores = view_scores(field, rays, views, progress=show)
         views, left_out = covered_views(views, scores, min_coverage)
         if left_out and not as_json:
             named = ", ".join(f"{name} ({score:.2f})" for name, score in left_out)
             print(f"left out {len(left_out)} of {given} views with a coverage below {min_coverage:g}: {named}")
     with _bar("dataset", as_json) as show:
-        written = dataset.generate_dataset(field, views, destination, _names(modalities), rig, file_format, progress=show)
+        written = dataset.generate_dataset(
+            field, views, destination, names, rig, file_format, wanted, rays, sensors, seed, share, progress=show
+        )
     unseen = [{"name": name, "coverage_score": score} for name, score in left_out]
-    facts = {"dataset": str(written), "views": len(views), "left_out": unseen}
-    print(json.dumps(facts) if as_json else f"wrote {len(views)} views into {destination}/")
+    facts = {"dataset": None if written is None else str(written), "views": len(views), "left_out": unseen}
+    if as_json:
+        print(json.dumps(facts))
+    elif written is None:
+        print(f"process {share.number} of {share.processes}: its share of {len(views)} views is in {destination}/, others are at work")
+    else:
+        print(f"wrote {len(views)} views into {destination}/")
+
+
+@command("batch")
+def batch(
+    scenes: Annotated[Path, typer.Argument(help="text file, one scene folder a line")],
+    poses: Annotated[Path | None, typer.Option(help="of a dataset of each, as for generate-dataset; none: only fits")] = None,
+    recipe: RecipeOption = None,
+    modalities: ModalitiesOption = None,
+    budget: Annotated[str | None, typer.Option(help="time of each fit, e.g. 60s or 5m")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="or its optimiser steps")] = None,
+    rig: Annotated[str, typer.Option(help="aligned or native")] = "aligned",
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr, tiff, webdataset or mms-data")] = "npz",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    device: DeviceOption = "auto",
+    out: Annotated[Path, typer.Option(help="results of each scene go into OUT/NAME")] = Path("batch"),
+    as_json: JsonOption = False,
+) -> None:
+    """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
+    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.operations.batch import Job, read_scene_list, run_batch
+    from mmsynth.operations.share import share_of_environment
+
+    if steps is not None and budget is not None:
+        raise InputError("--steps and --budget: give one of the two.")
+    listed, share = read_scene_list(scenes), share_of_environment()
+    names = _names(modalities)
+    seconds = _seconds(budget) if budget else None
+    job = Job(
+        load_recipe(recipe), steps, seconds, seed, pick_device(device), None if names is None else tuple(names), poses, rig, file_format
+    )
+    outcomes = run_batch(listed, out, job, share, say=(lambda text: None) if as_json else print)
+    if as_json:
+        print(json.dumps({"out": str(out), "scenes": outcomes}))
+    failed = [name for name, outcome in outcomes.items() if "error" in outcome]
+    if failed:
+        raise InputError(f"batch: {len(failed)} of {len(outcomes)} scenes failed, first: {outcomes[failed[0]]['error']}")
 
 
 @command("simulate")
@@ -378,24 +445,29 @@ def simulate(
 ) -> None:
     """The sensor's digital twin: raw frames as it would have recorded them, a scene that can be fitted again."""
     from mmsynth.operations import simulate as twins
+    from mmsynth.operations.share import share_of_environment
     from mmsynth.operations.trajectories import load_views
 
     if (poses is None) == (views is None):
         raise InputError("simulate: give one of --poses and --views.")
+    share = share_of_environment()
     folder, field, scene = _load(run)
     destination = out or folder / "simulated"
     with _bar("simulate", as_json) as show:
         if poses is not None:
             at = load_views(_poses_file(poses, scene.root), field, scene)
-            written = twins.simulate(field, sensor, at, destination, seed, file_format, rig, delta, progress=show)
+            written = twins.simulate(field, sensor, at, destination, seed, file_format, rig, delta, share, show)
         else:
             if rig != "native":
                 raise InputError("--rig: frames of the scene have their sensors' own poses, expected it with --poses.")
             split = {"train": scene.split.train, "test": scene.split.test, "all": None}
             chosen = split[views] if views in split else _views(views)
-            written = twins.simulate_at_frames(field, scene, sensor, destination, chosen, seed, file_format, delta, progress=show)
+            written = twins.simulate_at_frames(field, scene, sensor, destination, chosen, seed, file_format, delta, share, show)
     if as_json:
-        print(json.dumps({"scene": str(written.parent)}))
+        print(json.dumps({"scene": str(destination)}))
+        return
+    if written is None:
+        print(f"process {share.number} of {share.processes}: its share of the frames is in {destination}/, others are at work")
         return
     for line in twins.foretold(written.parent):
         print(line)

@@ -11,6 +11,7 @@ Layout of ``<out>``::
         flow.npz             flow to the next view, occluded (see ``flow``); the last view has none
         image.png            16-bit linear picture of the first modality (for transforms.json and for looking)
         view.json            camera and pose per modality, the files and their hashes; written last: the view is complete
+    raw/                     where sensors were asked for: their raw frames, a scene in the layout of MMS-DATA (see ``simulate``)
 
 As ``exr`` or ``tiff`` the records are of that type. ``webdataset`` packs 64 views at a time into shards/NNNNNN.tar, whose sidecar is
 written last, and removes their folders. ``mms-data`` puts the modalities into modalities/NAME/NNNN.tiff (16 bits, clipped to [0, 1]) with
@@ -44,6 +45,7 @@ from mmsynth.operations.progress import Counter, Progress
 from mmsynth.operations.records import CONVENTIONS, UNITS, camera_json, field_hash, modality_arrays, read_record, sensor_json, write_record
 from mmsynth.operations.records import FORMATS as RECORD_FORMATS
 from mmsynth.operations.share import Share
+from mmsynth.operations.simulate import simulate
 from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import write_png16
 from mmsynth.scene.mmsdata import meta_content
@@ -71,6 +73,8 @@ def generate_dataset(
     format: str = "npz",
     outputs: Sequence[str] | None = None,
     rays: TrainingRays | None = None,
+    sensors: Sequence[str | Path] = (),
+    seed: int = 0,
     share: Share | None = None,
     progress: Progress | None = None,
 ) -> Path | None:
@@ -83,8 +87,9 @@ def generate_dataset(
             modality is seen by its own camera from its own place on the rig.
         format: "npz", "exr" (named float channels), "tiff" (16-bit images, float geometry), "webdataset" or "mms-data".
         outputs: of "geometry", "flow" and "coverage", what is wanted beside the modalities; None: all of it, coverage with ``rays`` only.
-        rays: of the training frames (``coverage.training_rays``). share: the part of the views that this process renders, None: all.
-        progress: called with (rays done, rays in all); finished views count at once.
+        rays: of the training frames (``coverage.training_rays``). sensors: files of those whose raw frames at these views go into raw/, a
+            scene of its own (see ``simulate``, also for ``seed``). share: the part of the views that this process renders, None: all.
+        progress: called with (rays done, rays in all); finished views count at once. Raw frames come after them, and count anew.
     Returns:
         the path of ``dataset.json``; None where other processes have not finished their views yet: the last one writes it.
     Raises:
@@ -109,7 +114,8 @@ def generate_dataset(
             if plan.shard(index) is None:
                 pack_shard(plan.out, shard_name(index), range(first, index + 1))
                 plan.shard(index)
-    return _summary(plan)
+    raw = simulate(field, sensors, views, plan.out / "raw", seed, rig=rig, share=share, progress=progress) if sensors else None
+    return None if sensors and raw is None else _summary(plan, raw)
 
 
 @dataclass(frozen=True)
@@ -314,8 +320,8 @@ def _geometry_arrays(rendering: Rendering, pose: np.ndarray) -> dict[str, np.nda
     }
 
 
-def _summary(plan: _Plan) -> Path | None:
-    """Write what stands above the views, once all of them are there."""
+def _summary(plan: _Plan, raw: Path | None) -> Path | None:
+    """Write what stands above the views, once all of them are there; raw: the meta_data.json of their raw frames."""
     out, views = plan.out, []
     shards: dict[str, dict[str, Any]] = {}
     for index in range(len(plan.placed)):
@@ -336,7 +342,9 @@ def _summary(plan: _Plan) -> Path | None:
     if plan.format == "mms-data":
         files.append(out / "meta_data.json")
         write_json(files[-1], _meta(plan.field, out, list(plan.request["modalities"]), plan.placed))
-    listed = {path.name: {"sha256": sha256_of(path), "bytes": path.stat().st_size} for path in files}
+    if raw is not None:
+        files += [raw, *(path for kind in ("modalities", "sensors", "sidecars") for path in sorted((raw.parent / kind).rglob("[!.]*.*")))]
+    listed = {str(path.relative_to(out)): {"sha256": sha256_of(path), "bytes": path.stat().st_size} for path in files}
     write_json(out / "dataset.json", {**plan.request, "files": listed} | ({"shards": shards} if shards else {}) | {"views": views})
     return out / "dataset.json"
 

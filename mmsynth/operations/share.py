@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
+import torch
+
 from mmsynth.errors import InputError
 
 
@@ -33,3 +35,10 @@ def share_of_environment() -> Share:
     if not (rank.isdecimal() and size.isdecimal() and int(rank) < int(size)):
         raise InputError(f"environment: RANK is {rank!r} and WORLD_SIZE {size!r}, expected whole numbers, RANK below WORLD_SIZE.")
     return Share(int(rank), int(size))
+
+
+def local_device(device: str) -> str:
+    """ "cuda" → the GPU of this process (torchrun's LOCAL_RANK, modulo how many there are); anything else as it is."""
+    if device != "cuda":
+        return device
+    return f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % torch.cuda.device_count()}"

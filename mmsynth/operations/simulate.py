@@ -32,6 +32,7 @@ from mmsynth.files import read_json, sha256_of, write_json, write_text
 from mmsynth.operations.convert import source_views
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.operations.records import CONVENTIONS, camera_json, field_hash
+from mmsynth.operations.share import Share
 from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import write_dng, write_png, write_tiff
 from mmsynth.scene.mmsdata import meta_content
@@ -302,16 +303,18 @@ def simulate(
     format: str = "png",
     rig: str = "native",
     delta: bool = False,
+    share: Share | None = None,
     progress: Progress | None = None,
-) -> Path:
+) -> Path | None:
     """Simulate sensors at views and write them as a scene (layout: module docstring).
 
     Args:
         sensors: sensor files, or names of packaged ones. views: of the rig's reference; a view whose name is a number keeps it as its id.
         seed: of all noise and patterns. rig: "native": each sensor at its place on the rig; "aligned": all at the view's own pose.
-        delta: see ``plan_sensor``. progress: called with (rays done, rays in all).
+        delta: see ``plan_sensor``. share: the part of the frames that this process makes, None: all.
+        progress: called with (rays done, rays in all).
     Returns:
-        the path of ``meta_data.json``.
+        the path of ``meta_data.json``; None where other processes have not finished their frames yet: the last one writes it.
     Raises:
         InputError: see ``plan_sensor``; no views; two sensors of one name; a format that cannot hold a sensor; the disk refused.
     """
@@ -324,7 +327,7 @@ def simulate(
     for p in planned:
         for camera, pose, name in views:
             requests.append((p, p.camera or camera, pose if rig == "aligned" else pose @ p.to_reference, name))
-    return _write(field, planned, requests, Path(out), seed, format, progress)
+    return _write(field, planned, requests, Path(out), seed, format, share or Share(), progress)
 
 
 def simulate_at_frames(
@@ -336,8 +339,9 @@ def simulate_at_frames(
     seed: int = 0,
     format: str = "png",
     delta: bool = False,
+    share: Share | None = None,
     progress: Progress | None = None,
-) -> Path:
+) -> Path | None:
     """``simulate`` at the frames of the scene itself, with their ids: an instance at the frames of its own sensor, as the fit corrected
     their poses; a virtual sensor at those of the first one.
 
@@ -354,7 +358,7 @@ def simulate_at_frames(
         else:
             views = source_views(field, scene, first, chosen)
             requests += [(p, p.camera or camera, pose @ p.to_reference, name) for camera, pose, name in views]
-    return _write(field, planned, requests, Path(out), seed, format, progress)
+    return _write(field, planned, requests, Path(out), seed, format, share or Share(), progress)
 
 
 def foretold(scene: Path) -> list[str]:
@@ -397,10 +401,10 @@ def _write(
     out: Path,
     seed: int,
     format: str,
+    share: Share,
     progress: Progress | None,
-) -> Path:
+) -> Path | None:
     known = field_hash(field)
-    count = Counter(progress, sum(p.supersampling**2 * camera.width * camera.height for p, camera, _, _ in requests))
     frames: list[tuple[Simulated, int, Camera, np.ndarray]] = []
     for p in planned:
         own = [(camera, pose, name) for q, camera, pose, name in requests if q is p]
@@ -410,16 +414,25 @@ def _write(
     (out / "meta_data.json").unlink(missing_ok=True)  # it must not vouch for frames of another request
     for p in planned:
         write_text(out / "sensors" / f"{p.sensor.name}.toml", sensor_to_toml(p.file))
-    for p, i, camera, pose in frames:
+    mine = share.of(len(frames))
+    count = Counter(progress, sum(p.supersampling**2 * camera.width * camera.height for p, _, camera, _ in (frames[k] for k in mine)))
+    complete = True
+    for k, (p, i, camera, pose) in enumerate(frames):
         name = p.sensor.name
-        goal = count.done + p.supersampling**2 * camera.width * camera.height
         path, sidecar = out / "modalities" / name / f"{i:04d}.{format}", out / "sidecars" / name / f"{i:04d}.json"
         facts = _facts(p, camera, pose, i, seed, known)
-        if not _finished(sidecar, facts, path):
+        finished = _finished(sidecar, facts, path)
+        if k not in mine:
+            complete &= finished
+            continue
+        goal = count.done + p.supersampling**2 * camera.width * camera.height
+        if not finished:
             sidecar.unlink(missing_ok=True)
             _write_frame(path, simulate_frame(field, p, camera, pose, i, seed, count), p)
             write_json(sidecar, {**facts, "file": f"modalities/{name}/{path.name}", "sha256": sha256_of(path)})
         count(goal - count.done)
+    if not complete:
+        return None
     write_json(out / "meta_data.json", content)
     return out / "meta_data.json"
 

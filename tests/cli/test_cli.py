@@ -16,12 +16,12 @@ from mmsynth.data import data_folder
 ROOT = Path(__file__).parents[2]
 
 
-def run(cwd: Path, *args: str, largest_file: int | None = None) -> subprocess.CompletedProcess[str]:
+def run(cwd: Path, *args: str, largest_file: int | None = None, **variables: str) -> subprocess.CompletedProcess[str]:
     def limit() -> None:
         if largest_file is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
 
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", **variables}
     return subprocess.run(
         [sys.executable, "-m", "mmsynth", *args], cwd=cwd, env=environment, capture_output=True, text=True, preexec_fn=limit
     )
@@ -151,6 +151,60 @@ def test_generate_dataset_leaves_out_what_no_frame_saw(fitted: Path, tmp_path: P
     assert facts["views"] == 2 and facts["left_out"][0]["name"] == "away" and facts["left_out"][0]["coverage_score"] < 0.3
     refused(run(fitted, *args, "--min-coverage", "30"), "--min-coverage 30", "from 0 to 1")
     refused(run(fitted, *args, "--min-coverage", "1"), "the best of 3 views")
+
+
+def test_two_processes_make_the_dataset_of_one(fitted: Path, tmp_path: Path) -> None:
+    (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 5}))
+    command = (
+        "generate-dataset",
+        "--poses",
+        str(tmp_path / "orbit.json"),
+        "--modalities",
+        "mono,nir",
+        "--sensor",
+        "bayer_rgb",
+        "--seed",
+        "3",
+    )
+    assert run(fitted, *command, "--out", str(tmp_path / "one")).returncode == 0
+    outputs = []
+    for rank in ("1", "0"):
+        result = run(fitted, *command, "--out", str(tmp_path / "two"), RANK=rank, WORLD_SIZE="2")
+        assert result.returncode == 0, result.stderr
+        outputs.append(result.stdout)
+    assert "process 1 of 2" in outputs[0] and "wrote 5 views" in outputs[1]
+    one, two = (
+        {str(p.relative_to(tmp_path / n)): p.read_bytes() for p in (tmp_path / n).rglob("*.*") if p.is_file()} for n in ("one", "two")
+    )
+    assert one == two and {"dataset.json", "raw/meta_data.json", "views/0004/geometry.npz", "views/0003/flow.npz"} < set(one)
+    result = run(fitted, *command, "--out", str(tmp_path / "two"), "--verify", "--json")
+    assert json.loads(result.stdout)["problems"] == []
+    raw = next(p for p in (tmp_path / "two/raw/modalities").rglob("*.png"))
+    raw.write_bytes(raw.read_bytes()[:-3])
+    refused(run(fitted, *command, "--out", str(tmp_path / "two"), "--verify"), "1 problems", raw.name)
+    refused(run(fitted, *command, "--out", "no", "--raw"), "mono.toml")
+    refused(run(fitted, *command, "--out", "no", RANK="2", WORLD_SIZE="2"), "RANK")
+
+
+def test_a_batch_goes_on_after_a_scene_that_fails(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "good").symlink_to(scene)
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "list.txt").write_text("bad  # holds nothing\n\ngood\n")
+    (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 2}))
+    command = ("batch", "list.txt", "--steps", "12", "--modalities", "mono,nir", "--poses", "orbit.json", "--format", "webdataset")
+    result = run(tmp_path, *command)
+    assert result.returncode == 2 and "1 of 2 scenes failed" in result.stderr and "bad" in result.stderr
+    assert json.loads((tmp_path / "batch/bad/outcome.json").read_text())["error"].startswith("bad")
+    name = scene.resolve().name
+    outcome = json.loads((tmp_path / "batch" / name / "outcome.json").read_text())
+    assert Path(tmp_path / outcome["dataset"]).is_file() and (tmp_path / outcome["run"] / "report.html").is_file()
+    before = (tmp_path / outcome["run"] / "manifest.json").read_bytes()
+    again = run(tmp_path, *command, "--json")
+    assert again.returncode == 2 and set(json.loads(again.stdout)["scenes"]) == {"bad", name}
+    assert (tmp_path / outcome["run"] / "manifest.json").read_bytes() == before
+    refused(run(tmp_path, "batch", "nothing.txt"), "nothing.txt")
+    (tmp_path / "twice.txt").write_text("good\ngood\n")
+    refused(run(tmp_path, "batch", "twice.txt"), "twice.txt", name)
 
 
 MONO_TOML = """name = "nir"
