@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
     from mmsynth.fitting.trainer import fit
+    from mmsynth.operations.aligned_dataset import AlignedDataset
     from mmsynth.operations.calibrate_noise import calibrate_noise
-    from mmsynth.operations.convert import convert
+    from mmsynth.operations.conversion import convert
     from mmsynth.operations.dataset import generate_dataset
     from mmsynth.operations.evaluate import evaluate
     from mmsynth.operations.mesh import extract_mesh, write_mesh
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from mmsynth.sensors.twin import SensorTwin
 
 _HOMES = {
+    "AlignedDataset": "operations.aligned_dataset",
     "InputError": "errors",
     "Field": "field.field",
     "Rendering": "field.field",
@@ -38,14 +40,16 @@ _HOMES = {
     "Recipe": "fitting.recipe",
     "load_recipe": "fitting.recipe",
     "fit": "fitting.trainer",
-    "convert": "operations.convert",
+    "convert": "operations.conversion",
     "generate_dataset": "operations.dataset",
     "evaluate": "operations.evaluate",
     "extract_mesh": "operations.mesh",
     "write_mesh": "operations.mesh",
     "load_scene": "scene.load",
+    "simulate": "operations.simulate",
 }
 __all__ = [
+    "AlignedDataset",
     "Field",
     "InputError",
     "Recipe",

@@ -67,6 +67,12 @@ def _views(text: str | None) -> tuple[int, ...] | None:
     return tuple(int(v) for v in text.split(","))
 
 
+def _poses_file(path: Path, folder: Path) -> Path:
+    """As given, else in the scene's folder."""
+    within = folder / path
+    return within if not path.exists() and within.exists() else path
+
+
 def _frames(text: str | None) -> dict[str, int]:
     from mmsynth.scene.scene import canonical_modality
 
@@ -268,30 +274,37 @@ def convert(
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
     method: Annotated[str, typer.Option(help="auto, field, ratio or guided")] = "auto",
     images: Annotated[
-        list[Path] | None, typer.Option(help="frames of the source without a pose, once per file: found by what they show")
+        list[Path] | None, typer.Option(help="frames of the source, once per file: found by what they show, or at --poses by their names")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="poses of the source, as for generate-dataset; without --images the field alone is rendered")
     ] = None,
     as_sensor: Annotated[
         bool, typer.Option("--as-sensor", help="from the target's own place, through its lens; else on the source's pixels")
     ] = False,
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
     out: Annotated[Path | None, typer.Option(help="default: RUN/convert/FROM_to_TO")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Another modality at the poses of the frames of one."""
-    from mmsynth.operations.convert import convert as convert_frames
-    from mmsynth.operations.convert import convert_images
+    """Another modality at the poses of the frames of one, or at any poses."""
+    from mmsynth.operations.convert import convert_at_poses, convert_frames, convert_images
+    from mmsynth.operations.trajectories import load_views
     from mmsynth.scene.scene import canonical_modality
 
     folder, field, scene = _load(run)
     a, b = canonical_modality(source), canonical_modality(target)
+    if views is not None and (images or poses):
+        raise InputError("--views: frames of the scene are converted with it, expected it without --images and --poses.")
     chosen = _views(views)
     destination = out or folder / "convert" / f"{a}_to_{b}"
     with _bar(f"{a} to {b}", as_json) as show:
-        if images:
-            if views is not None or as_sensor:
-                raise InputError("--images: their own pixels are converted, expected neither --views nor --as-sensor.")
-            written = convert_images(field, scene, a, b, images, destination, method, progress=show)
+        if poses is not None:
+            at = load_views(_poses_file(poses, scene.root), field, scene, a)
+            written = convert_at_poses(field, a, b, at, destination, images or [], method, as_sensor, file_format, show)
+        elif images:
+            written = convert_images(field, scene, a, b, images, destination, method, as_sensor, file_format, show)
         else:
-            written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, progress=show)
+            written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, file_format, show)
     _tell(destination, written, as_json)
 
 
@@ -317,7 +330,7 @@ def generate_dataset(
     as_json: JsonOption = False,
 ) -> None:
     """An aligned dataset: every modality, depth, normal, opacity, intrinsics and pose per view."""
-    from mmsynth.operations import dataset
+    from mmsynth.operations import dataset, dataset_index
     from mmsynth.operations.coverage import covered_views, training_rays, view_scores
     from mmsynth.operations.trajectories import load_views
 
@@ -326,13 +339,12 @@ def generate_dataset(
     folder, field, scene = _load(run)
     destination = out or folder / "dataset"
     if verify:
-        problems = dataset.verify(destination)
+        problems = dataset_index.verify(destination)
         if problems:
             raise InputError(f"{destination}: {len(problems)} problems, first: {problems[0]}")
         print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")
         return
-    path = poses if poses.exists() or poses.is_absolute() else scene.root / poses
-    views = load_views(path if path.exists() else poses, field, scene)
+    views = load_views(_poses_file(poses, scene.root), field, scene)
     left_out: list[tuple[str, float]] = []
     if min_coverage is not None:
         given = len(views)
@@ -374,8 +386,7 @@ def simulate(
     destination = out or folder / "simulated"
     with _bar("simulate", as_json) as show:
         if poses is not None:
-            path = poses if poses.exists() or poses.is_absolute() else scene.root / poses
-            at = load_views(path if path.exists() else poses, field, scene)
+            at = load_views(_poses_file(poses, scene.root), field, scene)
             written = twins.simulate(field, sensor, at, destination, seed, file_format, rig, delta, progress=show)
         else:
             if rig != "native":

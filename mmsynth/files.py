@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Callable
@@ -62,3 +63,9 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: not UTF-8 text at byte {error.start}.") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from mmsynth.errors import InputError
 from mmsynth.operations.guidance import Guide, contrast, guide, linear_map
@@ -53,6 +55,72 @@ class Converted:
     exposure: float
     opacity: np.ndarray
     valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """``Converted`` of a batch, as tensors on the device of the frames.
+
+    Attributes:
+        values: (B, K, H, W) float32. stokes: (B, 3, H, W) or None. confidence, guided, valid: (B, 1, H, W). exposure: (B,).
+        method: the one used.
+    """
+
+    values: Tensor
+    stokes: Tensor | None
+    confidence: Tensor
+    guided: Tensor
+    valid: Tensor
+    exposure: Tensor
+    method: str
+
+
+def convert(
+    field: Field,
+    frames: Tensor,
+    *,
+    source: str,
+    target: str,
+    poses: Tensor,
+    method: str = "auto",
+    camera: Camera | None = None,
+    target_poses: Tensor | None = None,
+    target_camera: Camera | None = None,
+) -> Conversion:
+    """Convert a batch of frames.
+
+    Args:
+        frames: (B, 1, H, W) of a mosaicked source, raw, else (B, C, H, W); linear, 1.0 = full scale. poses: (B, 4, 4) camera_to_world of
+            the frames, OpenCV axes, scene frame (``register.register`` finds those of frames without one).
+        method: auto, field, ratio or guided. camera: of the frames, None: the source's. target_poses: (B, 4, 4), where the target stands,
+            with ``target_camera`` (None: the target's); None: the frames' own pixels.
+    Raises:
+        InputError: unknown modality or method, or shapes that do not fit.
+    """
+    source, target = canonical_modality(source), canonical_modality(target)
+    field.check_modalities([source, target])
+    if frames.ndim != 4 or poses.shape != (len(frames), 4, 4) or not len(frames):
+        raise InputError(f"convert: frames {tuple(frames.shape)}, poses {tuple(poses.shape)}; expected (B, C, H, W) and (B, 4, 4), B > 0.")
+    if target_poses is not None and target_poses.shape != poses.shape:
+        raise InputError(f"convert: target_poses {tuple(target_poses.shape)}, expected {tuple(poses.shape)}.")
+    there = target_camera or field.cameras[target]
+    found = []
+    for i, frame in enumerate(frames.detach().cpu().double().numpy()):
+        raw = frame[0] if field.sensors[source].mosaic is not None and len(frame) == 1 else np.moveaxis(frame, 0, -1)
+        seen_by = None if target_poses is None else (there, target_poses[i].detach().cpu().double().numpy())
+        pose = poses[i].detach().cpu().double().numpy()
+        found.append(convert_frame(field, raw, camera or field.cameras[source], pose, source, target, method, seen_by))
+    images = lambda arrays: torch.from_numpy(np.stack(arrays)).to(frames.device).movedim(-1, 1)
+    stokes = [c.stokes for c in found if c.stokes is not None]
+    return Conversion(
+        values=images([c.values for c in found]),
+        stokes=images(stokes) if stokes else None,
+        confidence=images([c.confidence[..., None] for c in found]),
+        guided=images([c.guided[..., None] for c in found]),
+        valid=images([c.valid[..., None] for c in found]),
+        exposure=torch.tensor([c.exposure for c in found], device=frames.device),
+        method=found[0].method,
+    )
 
 
 def chosen_method(method: str, source: Sensor, target: Sensor) -> str:
@@ -117,6 +185,21 @@ def convert_frame(
     strange = visible & (carried[..., -1] > 0.5)
     maps = carried[..., : gain.shape[-1]], carried[..., gain.shape[-1] : -3], carried[..., -3]
     return _put_together(field, target, used, there, maps, visible & (carried[..., -2] > 0.99) & ~strange, strange, hint)
+
+
+def render_frame(field: Field, camera: Camera, pose: np.ndarray, target: str, progress: Callable[[int], None] | None = None) -> Converted:
+    """What the target sensor would have seen at a pose where there is no frame: the field alone."""
+    seen = field.render(camera, pose, [target], geometry=False, progress=progress)
+    return Converted(
+        method="field",
+        values=seen.channels[target],
+        stokes=seen.stokes.get(target),
+        confidence=np.where(seen.valid, 1.0, 0.0).astype(np.float32),
+        guided=np.zeros_like(seen.valid),
+        exposure=1.0,
+        opacity=seen.opacity,
+        valid=seen.valid,
+    )
 
 
 def _put_together(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,65 +13,18 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.files import write_json
 from mmsynth.operations import previews
-from mmsynth.operations.conversion import Converted, chosen_method, convert_frame
+from mmsynth.operations.conversion import Converted, chosen_method, convert_frame, render_frame
 from mmsynth.operations.progress import Counter, Progress
+from mmsynth.operations.records import CONVENTIONS, FORMATS, UNITS, camera_json, modality_arrays, sensor_json, write_record
 from mmsynth.operations.register import landmarks, register
 from mmsynth.operations.trajectories import View
-from mmsynth.scene.images import load_frame, write_npz, write_png16
+from mmsynth.scene.images import load_frame, write_png16
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.mosaic import photosites_of
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
-
-
-def wavelengths_array(sensor: Sensor) -> np.ndarray:
-    """(C,) float32 nm, NaN where a channel is broad or unknown."""
-    return np.array([np.nan if w is None else w for w in sensor.wavelengths_nm], np.float32)
-
-
-def camera_json(camera: Camera, camera_to_world: np.ndarray) -> dict[str, Any]:
-    """Intrinsics, lens and pose in the library's conventions, ready for JSON."""
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "lens": camera.lens,
-        "distortion": list(camera.distortion),
-        "camera_to_world": np.asarray(camera_to_world, dtype=np.float64).tolist(),
-    }
-
-
-def sensor_json(sensor: Sensor) -> dict[str, Any]:
-    """Channel names, wavelengths and analyser angles of a sensor, ready for JSON."""
-    return {
-        "channels": list(sensor.channels),
-        "wavelengths_nm": list(sensor.wavelengths_nm),
-        "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
-    }
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def modality_arrays(sensor: Sensor, values: np.ndarray, stokes: np.ndarray | None) -> dict[str, np.ndarray]:
-    """What a file of one modality holds: data (H, W, C), channels, wavelengths_nm (NaN = none) and, for polarization, stokes (H, W, 3)."""
-    arrays = {
-        "data": values.astype(np.float32),
-        "channels": np.array(sensor.channels, dtype=np.str_),
-        "wavelengths_nm": wavelengths_array(sensor),
-    }
-    if stokes is not None:
-        arrays["stokes"] = stokes.astype(np.float32)
-        arrays["polarizer_angles_deg"] = np.array(sensor.polarizer_angles_deg, np.float32)
-    return arrays
 
 
 def source_views(field: Field, scene: Scene, source: str, views: Sequence[int] | None = None) -> list[View]:
@@ -105,7 +57,7 @@ def _ranges(ids: set[int]) -> str:
     return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
 
 
-def convert(
+def convert_frames(
     field: Field,
     scene: Scene,
     source: str,
@@ -114,6 +66,7 @@ def convert(
     views: Sequence[int] | None = None,
     method: str = "auto",
     as_sensor: bool = False,
+    format: str = "npz",
     progress: Progress | None = None,
 ) -> list[Path]:
     """What modality ``target`` would have seen at every ``source`` frame: on the frame's own pixels (intrinsics and lens included), aligned
@@ -121,33 +74,32 @@ def convert(
 
     Per view, in ``<out>/<target>/``:
 
-    * ``NAME.npz``: data (H, W, C) float32, opacity, valid, confidence, guided, channels, wavelengths_nm; polarization also stokes (H, W, 3)
-      in this camera's x-axis frame; with ``as_sensor`` and a mosaic also raw (H, W), what its photosites measure;
+    * ``NAME.npz`` or ``NAME.exr`` (see ``records``): data (H, W, C) float32, opacity, valid, confidence, guided; polarization also stokes
+      (H, W, 3) in this camera's x-axis frame; with ``as_sensor`` and a mosaic also raw (H, W), what its photosites measure;
     * ``NAME.png``: 16-bit preview, tone-mapped with one exposure for all views; for polarization S0, and ``NAME_dolp.png`` (grey)
       and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``); ``NAME_confidence.png``;
     * ``NAME.json``: camera, method, exposure, conventions, hash; written last, so a view with a sidecar is complete.
 
     Args:
-        views: view ids; None: all frames of the source. method: see ``conversion``. progress: called with (rays done, rays in all).
+        views: view ids; None: all frames of the source. method: see ``conversion``. format: "npz" or "exr".
+        progress: called with (rays done, rays in all).
     Returns:
         the files written, the sidecars included.
     Raises:
-        InputError: unknown modality, view or method, an unreadable frame, a target without a place on the rig, or the disk refused.
+        InputError: unknown modality, view, method or format, an unreadable frame, a target without a place on the rig, or the disk refused.
     """
     source, target = canonical_modality(source), canonical_modality(target)
     # known before anything is rendered or written
     field.check_modalities([target])
     chosen = source_views(field, scene, source, views)
     field.check_modalities([source])
-    if not chosen:
-        raise InputError(f"convert to {target}: no views, expected at least one frame.")
     frames = [f for f in scene.frames_of(source) if views is None or f.view in set(views)]
-    places = [_place(field, scene, source, target, frame) if as_sensor else None for frame in frames]
-    items = [
-        _Item(frame.path.name, name, camera, pose, place, functools.partial(_pixels, scene.sensors[source], frame), {})
-        for frame, (camera, pose, name), place in zip(frames, chosen, places, strict=True)
-    ]
-    return _convert_each(field, source, target, items, Path(out), method, progress)
+    items = []
+    for frame, (camera, pose, name) in zip(frames, chosen, strict=True):
+        own = next(iter(scene.frames_of(target, (frame.view,))), None) if as_sensor and target in scene.sensors else None
+        place = None if not as_sensor else (own.camera, field.pose_of(own)) if own else _on_the_rig(field, source, target, pose)
+        items.append(_Item(name, camera, pose, place, frame.path.name, functools.partial(_pixels, scene.sensors[source], frame)))
+    return _convert_each(field, source, target, items, Path(out), method, format, progress)
 
 
 def convert_images(
@@ -158,31 +110,85 @@ def convert_images(
     images: Sequence[Path],
     out: Path | str,
     method: str = "auto",
+    as_sensor: bool = False,
+    format: str = "npz",
     progress: Progress | None = None,
 ) -> list[Path]:
-    """``convert`` of frames without a pose, on their own pixels: each is registered against the field first (see ``register``).
+    """``convert_frames`` of frames without a pose: each is registered against the field first (see ``register``).
 
     Args:
         images: files of the source sensor, with its size, lens and mosaic. Their names become those of the results.
     Raises:
-        InputError: as ``convert``; a file of another size; a frame that cannot be registered, and why. Nothing is written then.
+        InputError: as ``convert_frames``; a file of another size; a frame that cannot be registered, and why. Nothing is written then.
     """
     source, target = canonical_modality(source), canonical_modality(target)
     field.check_modalities([source, target])
-    if not images:
-        raise InputError(f"convert to {target}: no images, expected at least one file.")
-    if len({path.stem for path in images}) < len(images):
-        raise InputError("convert: two images have one name, expected names that differ.")
+    _check_names(images)
     camera = field.cameras[source]
     known = landmarks(field, scene, source)
     items = []
     for path in images:
         frame = Frame(source, 0, path, camera, np.eye(4))
-        raw = _pixels(field.sensors[source], frame)
-        found = register(field, known, raw, camera, source, str(path))
+        found = register(field, known, _pixels(field.sensors[source], frame), camera, source, str(path))
         facts = {"covariance": found.covariance.tolist(), "sd_px": found.sd_px, "inliers": found.inliers, "residual": found.residual}
-        items.append(_Item(path.name, path.stem, camera, found.pose, None, functools.partial(_pixels, field.sensors[source], frame), facts))
-    return _convert_each(field, source, target, items, Path(out), method, progress)
+        place = _on_the_rig(field, source, target, found.pose) if as_sensor else None
+        read = functools.partial(_pixels, field.sensors[source], frame)
+        items.append(_Item(path.stem, camera, found.pose, place, path.name, read, facts))
+    return _convert_each(field, source, target, items, Path(out), method, format, progress)
+
+
+def convert_at_poses(
+    field: Field,
+    source: str,
+    target: str,
+    views: Sequence[View],
+    out: Path | str,
+    images: Sequence[Path] = (),
+    method: str = "auto",
+    as_sensor: bool = False,
+    format: str = "npz",
+    progress: Progress | None = None,
+) -> list[Path]:
+    """``convert_frames`` at any poses of the source: of frames that were taken there, or without any, when the field alone says it.
+
+    Args:
+        views: camera, pose and name of each (see ``trajectories.load_views``). images: frames of the source at some of them, each named as
+            its view is, suffixes apart; the other views are left out. Without images: all views.
+    Raises:
+        InputError: as ``convert_frames``; an image of no view; a method that needs frames where there are none.
+    """
+    source, target = canonical_modality(source), canonical_modality(target)
+    field.check_modalities([source, target])
+    places = lambda pose: _on_the_rig(field, source, target, pose) if as_sensor else None
+    if not images:
+        if method not in ("auto", "field"):
+            raise InputError(f"convert: method '{method}' needs frames of {source}, expected images at the poses, or the method field.")
+        plain = [_Item(_plain_name(name), camera, pose, places(pose)) for camera, pose, name in views]
+        return _convert_each(field, source, target, plain, Path(out), "field", format, progress)
+    _check_names(images)
+    known = {_plain_name(name): (camera, pose) for camera, pose, name in views}
+    items = []
+    for path in images:
+        if path.stem not in known:
+            some = ", ".join(list(known)[:3])
+            raise InputError(f"{path}: no pose has this name, expected one of {some}{', ...' if len(known) > 3 else ''}.")
+        camera, pose = known[path.stem]
+        frame = Frame(source, 0, path, camera, pose)
+        read = functools.partial(_pixels, field.sensors[source], frame)
+        items.append(_Item(path.stem, camera, pose, places(pose), path.name, read))
+    return _convert_each(field, source, target, items, Path(out), method, format, progress)
+
+
+def _check_names(images: Sequence[Path]) -> None:
+    if not images:
+        raise InputError("convert: no images, expected at least one file.")
+    if len({path.stem for path in images}) < len(images):
+        raise InputError("convert: two images have one name, expected names that differ.")
+
+
+def _plain_name(name: str) -> str:
+    """File stem of a view: "images/0007.png" → "0007"."""
+    return Path(name).stem
 
 
 def _pixels(sensor: Sensor, frame: Frame) -> np.ndarray:
@@ -191,21 +197,25 @@ def _pixels(sensor: Sensor, frame: Frame) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Item:
-    """A frame to convert: its file, the name of the results, camera and pose, those of the target if they are others, registration."""
+    """What to convert: name of the results, camera and pose, those of the target if they are others, and the frame, if there is one."""
 
-    file: str
     name: str
     camera: Camera
     pose: np.ndarray
     seen_by: tuple[Camera, np.ndarray] | None
-    read: Callable[[], np.ndarray]
-    registration: dict[str, Any]
+    file: str | None = None
+    read: Callable[[], np.ndarray] | None = None
+    registration: dict[str, Any] | None = None
 
 
 def _convert_each(
-    field: Field, source: str, target: str, items: Sequence[_Item], out: Path, method: str, progress: Progress | None
+    field: Field, source: str, target: str, items: Sequence[_Item], out: Path, method: str, format: str, progress: Progress | None
 ) -> list[Path]:
     sensor, folder = field.sensors[target], out / target
+    if not items:
+        raise InputError(f"convert to {target}: no views, expected at least one.")
+    if format not in FORMATS:
+        raise InputError(f"convert: format is {format!r}, expected one of {', '.join(FORMATS)}.")
     used = chosen_method(method, field.sensors[source], sensor)
     rays = [sum(c.width * c.height for c in (i.camera, *(() if i.seen_by is None else (i.seen_by[0],)))) for i in items]
     count = Counter(progress, sum(rays))
@@ -213,13 +223,15 @@ def _convert_each(
     exposure: float | None = None
     for item, cost in zip(items, rays, strict=True):
         goal = count.done + cost
-        found = convert_frame(field, item.read(), item.camera, item.pose, source, target, used, item.seen_by, progress=count)
+        if item.read is None:
+            found = render_frame(field, *(item.seen_by or (item.camera, item.pose)), target, progress=count)
+        else:
+            found = convert_frame(field, item.read(), item.camera, item.pose, source, target, used, item.seen_by, progress=count)
         count(goal - count.done)
         sidecar = folder / f"{item.name}.json"
         # a stale sidecar must not vouch for new files if this run is cut off
         sidecar.unlink(missing_ok=True)
-        data = folder / f"{item.name}.npz"
-        write_npz(data, _arrays(sensor, found, item.seen_by is not None))
+        files = write_record(folder, item.name, _arrays(sensor, found, item.seen_by is not None), format, UNITS, sensor)
         linear = previews.preview_linear(sensor, found.values)
         exposure = previews.exposure_of(linear) if exposure is None else exposure
         pictures = {
@@ -239,45 +251,29 @@ def _convert_each(
             "method": found.method,
             "frame_exposure": found.exposure,
             "guided": float(found.guided.mean()),
-            "registration": item.registration or None,
+            "registration": item.registration,
             "sensor": sensor_json(sensor),
             "camera": camera_json(*(item.seen_by or (item.camera, item.pose))),
             "conventions": CONVENTIONS,
             "unit": field.unit,
             "preview_exposure": exposure,
-            "data": {"file": data.name, "sha256": sha256_of(data)},
+            "files": files,
         }
         write_json(sidecar, facts)
-        written += [data, *pictures, sidecar]
+        written += [*(folder / name for name in files), *pictures, sidecar]
     return written
 
 
-def _place(field: Field, scene: Scene, source: str, target: str, frame: Frame) -> tuple[Camera, np.ndarray]:
-    """Camera and pose of the target sensor at a frame of the source: its own frame of that view, else its place on the rig."""
-    own = [f for f in scene.frames_of(target) if f.view == frame.view] if target in scene.sensors else []
-    if own:
-        return own[0].camera, field.pose_of(own[0])
+def _on_the_rig(field: Field, source: str, target: str, pose: np.ndarray) -> tuple[Camera, np.ndarray]:
+    """Camera and pose of the target sensor when the source has this pose."""
     if target not in field.cameras or source not in field.rig or target not in field.rig:
-        raise InputError(f"convert: {target!r} has no known place on the rig of {source!r}, expected a frame of it in view {frame.view}.")
-    return field.cameras[target], field.pose_of(frame) @ np.linalg.inv(field.rig[source]) @ field.rig[target]
+        raise InputError(f"convert: {target!r} has no known place on the rig of {source!r}, expected frames of both.")
+    return field.cameras[target], pose @ np.linalg.inv(field.rig[source]) @ field.rig[target]
 
 
 def _arrays(sensor: Sensor, found: Converted, as_sensor: bool) -> dict[str, np.ndarray]:
-    arrays = modality_arrays(sensor, found.values, found.stokes)
+    arrays = modality_arrays(found.values, found.stokes)
     arrays |= {"opacity": found.opacity, "valid": found.valid, "confidence": found.confidence, "guided": found.guided}
     if as_sensor and sensor.mosaic is not None:
         arrays["raw"] = photosites_of(found.values, sensor.mosaic)
     return arrays
-
-
-CONVENTIONS = {
-    "camera_axes": "OpenCV: x right, y down, z forward; camera_to_world 4x4",
-    "pixels": "centre of the top-left pixel is (0, 0)",
-    "distortion": "OpenCV's: lens brown_conrady k1 k2 p1 p2 k3 k4 k5 k6, kannala_brandt (fisheye) k1 k2 k3 k4, undistorted to distorted; "
-    "images are distorted, as the lens sees",
-    "radiance": "linear float32, 1.0 = full scale of the sensor; NaN where the lens has no ray",
-    "polarization": "S0 S1 S2 about the camera x axis; angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
-    "depth": "depth_z along the optical axis, depth_ray along the ray; NaN = no hit",
-    "normal": "world frame, unit, outward; NaN = no hit",
-    "world": "the scene's own frame and unit",
-}

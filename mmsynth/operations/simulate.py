@@ -28,10 +28,10 @@ from torch import Tensor
 
 import mmsynth
 from mmsynth.errors import InputError
-from mmsynth.files import read_json, write_json, write_text
-from mmsynth.operations.convert import CONVENTIONS, camera_json, sha256_of, source_views
-from mmsynth.operations.dataset import field_hash
+from mmsynth.files import read_json, sha256_of, write_json, write_text
+from mmsynth.operations.convert import source_views
 from mmsynth.operations.progress import Counter, Progress
+from mmsynth.operations.records import CONVENTIONS, camera_json, field_hash
 from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import write_dng, write_png, write_tiff
 from mmsynth.scene.mmsdata import meta_content

@@ -227,10 +227,10 @@ def training_poses(field: Field, scene: Scene) -> list[np.ndarray]:
     return []
 
 
-def load_views(path: Path | str, field: Field, scene: Scene | None = None) -> list[View]:
+def load_views(path: Path | str, field: Field, scene: Scene | None = None, sensor: str | None = None) -> list[View]:
     """Read a poses file or a trajectory (JSON with the key 'trajectory'); in the scene's world frame and unit.
 
-    Poses without intrinsics take the reference camera of the field.
+    Poses without intrinsics, and trajectories, take the camera of ``sensor``; None: the reference camera of the field.
 
     Args:
         scene: needed for a trajectory only: its training poses say what is up and how far away to be.
@@ -238,13 +238,14 @@ def load_views(path: Path | str, field: Field, scene: Scene | None = None) -> li
         InputError: unreadable file, unknown layout, or bad value.
     """
     path = Path(path)
+    own = None if sensor is None else field.cameras.get(sensor)
     if path.suffix.lower() == ".json":
         content = read_json(path)
         if isinstance(content, dict) and "trajectory" in content:
             training = training_poses(field, scene) if scene is not None else []
-            return trajectory_views(content, field.region, reference_camera(field), training, str(path))
+            return trajectory_views(content, field.region, own or reference_camera(field), training, str(path))
     poses = read_poses(path)
-    fallback = reference_camera(field) if any(camera is None for camera, _, _ in poses) else None
+    fallback = own or reference_camera(field) if any(camera is None for camera, _, _ in poses) else None
     views: list[View] = []
     for camera, pose, name in poses:
         chosen = camera or fallback

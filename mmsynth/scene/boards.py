@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -19,46 +19,69 @@ _WIDTH = 1000  # pixels: larger pictures are made smaller
 _VIEWS = 3  # that must agree on a corner
 _APART = 2.0  # pixels (of the smaller picture) by which they may disagree
 
+Corner = tuple[int, int, int]  # dictionary, marker, which of its four corners
 Sighting = tuple[Frame, np.ndarray]
 
 
 def board_points(frames: Sequence[Frame]) -> np.ndarray:
     """Corners of ArUco markers (those of ChArUco boards, too), triangulated: (N, 3) in the poses' frame; N = 0 where there are none.
 
-    A corner counts where at least three views see it and it projects to within two pixels of where they do: chance finds do not.
-
     Args:
         frames: of a sensor without a mosaic. Up to 16 of them are searched, evenly spread, and no more when 4 show no marker.
     """
+    return np.array(list(board_corners(frames, _grey).values()), dtype=np.float64).reshape(-1, 3)
+
+
+def board_corners(frames: Sequence[Frame], picture: Callable[[Frame], np.ndarray | None]) -> dict[Corner, np.ndarray]:
+    """As ``board_points``, by corner: (3,) each.
+
+    A corner counts where at least three views see it and it projects to within two pixels of where they do: chance finds do not.
+
+    Args:
+        picture: a frame's pixels as (H, W), linear; None where there are none.
+    """
     order = np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).round().astype(int)
     spread = np.linspace(0, len(order) - 1, min(_LOOK, len(order))).round().astype(int)
-    sightings: dict[tuple[int, int, int], list[Sighting]] = defaultdict(list)
+    sightings: dict[Corner, list[Sighting]] = defaultdict(list)
+
+    def look(frame: Frame) -> None:
+        grey = picture(frame)
+        for corner, pixel in ({} if grey is None else markers_in(grey)).items():
+            sightings[corner].append((frame, pixel))
+
     for i in order[spread]:
-        _look(frames[i], sightings)
+        look(frames[i])
     if not sightings:
-        return np.empty((0, 3))
+        return {}
     for i in np.delete(order, spread):
-        _look(frames[i], sightings)
-    points = [point for seen in sightings.values() if (point := _triangulated(seen)) is not None]
-    return np.array(points, dtype=np.float64).reshape(-1, 3)
+        look(frames[i])
+    return {corner: point for corner, seen in sightings.items() if (point := _triangulated(seen)) is not None}
 
 
-def _look(frame: Frame, sightings: dict[tuple[int, int, int], list[Sighting]]) -> None:
-    """Find the markers of a frame: dictionary, marker and corner → the frame and where in it the corner is."""
+def _grey(frame: Frame) -> np.ndarray | None:
     try:
         image = read_image(frame.path)
     except InputError:
-        return  # whoever needs the picture will say so
-    grey = image.reshape(*image.shape[:2], -1)[..., :3].mean(-1)
-    grey = np.sqrt(np.clip(grey / max(float(np.quantile(grey, 0.99)), 1e-9), 0.0, 1.0))
+        return None  # whoever needs the picture will say so
+    return np.asarray(image.reshape(*image.shape[:2], -1)[..., :3].mean(-1))
+
+
+def markers_in(grey: np.ndarray) -> dict[Corner, np.ndarray]:
+    """Corners of ArUco markers in a linear picture (H, W): (2,) px each; of a marker that is there twice, neither."""
+    level = np.sqrt(np.clip(grey / max(float(np.quantile(grey, 0.99)), 1e-9), 0.0, 1.0))
     scale = min(1.0, _WIDTH / max(grey.shape))
-    small = cv2.resize((255 * grey).astype(np.uint8), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = cv2.resize((255 * level).astype(np.uint8), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    out: dict[Corner, np.ndarray] = {}
+    twice: set[Corner] = set()
     for name in _DICTIONARIES:
         found, ids, _ = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(name)).detectMarkers(small)
         for corners, marker in zip(found, [] if ids is None else np.ravel(ids), strict=True):
-            for k, corner in enumerate(corners[0]):
+            for k, place in enumerate(corners[0]):
+                corner = (name, int(marker), k)
+                twice |= {corner} & out.keys()
                 # OpenCV resizes about the pictures' corners: pixel centres are at +0.5
-                sightings[name, int(marker), k].append((frame, (corner.astype(np.float64) + 0.5) / scale - 0.5))
+                out[corner] = (place.astype(np.float64) + 0.5) / scale - 0.5
+    return {corner: place for corner, place in out.items() if corner not in twice}
 
 
 def _triangulated(seen: list[Sighting]) -> np.ndarray | None:

@@ -190,10 +190,28 @@ def _read_dng(path: Path) -> np.ndarray:
     raise InputError(f"{path}: no mosaic in this DNG file, expected a colour filter array.")
 
 
-def _read_exr(path: Path) -> np.ndarray:
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """The channels (H, W) of an EXR file, by name.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    try:
+        return _exr_channels(path)
+    except Exception as error:
+        raise InputError(f"{path}: damaged or truncated image, could not be read ({_first_line(error)}).") from error
+
+
+def _exr_channels(path: Path) -> dict[str, np.ndarray]:
     with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings there, and --json promises nothing else
         file = OpenEXR.File(str(path), separate_channels=True)
-    channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    return {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    channels = _exr_channels(path)
+    if any(name.startswith("S0.") and name.endswith("nm") for name in channels):
+        channels = {name: pixels for name, pixels in channels.items() if name not in ("R", "G", "B", "A")}  # a preview of the spectrum
     colour = [name for name in ("R", "G", "B", "A") if name in channels]
     names = colour if set(colour) == set(channels) else sorted(channels, key=_natural)
     return np.stack([channels[name] for name in names], -1)
@@ -345,10 +363,10 @@ def write_dng(path: Path, numbers: np.ndarray, pattern: np.ndarray, black: int, 
     )
 
 
-def write_exr(path: Path, channels: Mapping[str, np.ndarray]) -> None:
-    """Write named (H, W) channels as 32-bit float OpenEXR (ZIP, lossless; NaN is kept)."""
-    arrays = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str] | None = None) -> None:
+    """Write named (H, W) channels as OpenEXR (ZIP, lossless; NaN is kept): half floats as they are, all others as 32-bit floats."""
+    arrays = {n: np.ascontiguousarray(c, None if c.dtype == np.float16 else np.float32) for n, c in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
 
     def write(temporary: Path) -> None:
         try:

@@ -91,6 +91,22 @@ def test_convert(fitted: Path) -> None:
     refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--method", "magic"), "magic", "guided")
 
 
+def test_every_public_name_is_there() -> None:
+    import mmsynth
+
+    assert all(callable(getattr(mmsynth, name)) for name in mmsynth.__all__)
+
+
+def test_convert_at_poses(fitted: Path, tmp_path: Path) -> None:
+    (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 2}))
+    orbit = ("--poses", str(tmp_path / "orbit.json"))
+    result = run(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--format", "exr", "--out", "orbit", "--json")
+    assert result.returncode == 0, result.stderr
+    assert {"0000.exr", "0001.exr", "0001.json"} < {Path(p).name for p in json.loads(result.stdout)["files"]}
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--method", "guided"), "needs frames of rgb")
+    refused(run(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--views", "9"), "--views", "--poses")
+
+
 def test_evaluate_conversions(fitted: Path) -> None:
     result = run(fitted, "evaluate", "--convert", "rgb:ms,mono:pol", "--json")
     assert result.returncode == 0, result.stderr

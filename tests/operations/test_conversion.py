@@ -11,9 +11,10 @@ import pytest
 import torch
 from analytic import MONO, MS, POL, RGB, AnalyticField, ring_pose, scene_of, sphere
 
+import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion import Converted, chosen_method, convert_frame
-from mmsynth.operations.convert import convert
+from mmsynth.operations.convert import convert_frames
 from mmsynth.operations.guidance import guide, linear_map
 from mmsynth.scene.scene import Sensor
 from mmsynth.sensors.camera import Camera
@@ -207,7 +208,7 @@ def test_methods_by_name() -> None:
 def test_files_of_a_target_at_its_own_place(tmp_path: Path) -> None:
     field: Any = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
-    convert(field, scene, "rgb", "ms", tmp_path / "out", [1], as_sensor=True)
+    convert_frames(field, scene, "rgb", "ms", tmp_path / "out", [1], as_sensor=True)
     sidecar = json.loads((tmp_path / "out/ms/0001.json").read_text())
     np.testing.assert_allclose(sidecar["camera"]["camera_to_world"], scene.frames_of("ms")[1].camera_to_world, atol=1e-12)
     assert sidecar["method"] == "guided" and 0 < sidecar["guided"] <= 1
@@ -215,3 +216,29 @@ def test_files_of_a_target_at_its_own_place(tmp_path: Path) -> None:
         expected = mosaic(torch.from_numpy(arrays["data"]).movedim(-1, 0), MS.mosaic).numpy()  # type: ignore[arg-type]
         np.testing.assert_array_equal(arrays["raw"], expected)
         assert arrays["confidence"].shape == (18, 24) and arrays["guided"].dtype == bool
+
+
+def test_tensors_in_batches() -> None:
+    """As frames one by one, in kornia's layout."""
+    field: Any = WrongField(sphere())
+    poses = [POSE, ring_pose(1, 4)]
+    raw = np.stack([frame(RGB), frame(RGB, pose=poses[1])])
+    found = mmsynth.convert(
+        field, torch.from_numpy(raw)[:, None], source="rgb", target="pol", poses=torch.from_numpy(np.stack(poses)), camera=CAMERA
+    )
+    assert found.values.shape == (2, 4, 72, 96) and found.stokes is not None and found.stokes.shape == (2, 3, 72, 96)
+    assert found.confidence.shape == found.guided.shape == found.valid.shape == (2, 1, 72, 96) and found.method == "ratio"
+    for i in range(2):
+        one = convert_frame(field, raw[i], CAMERA, poses[i], "rgb", "pol")
+        np.testing.assert_array_equal(found.stokes[i].numpy(), np.moveaxis(one.stokes, -1, 0))  # type: ignore[arg-type]
+        assert float(found.exposure[i]) == pytest.approx(one.exposure, rel=1e-6)
+    colours = torch.from_numpy(np.moveaxis(frame(MONO), -1, 0))[None]
+    beside = torch.from_numpy(ring_pose(1, 90))[None]
+    there = mmsynth.convert(
+        field, colours, source="mono", target="ms", poses=torch.from_numpy(POSE)[None], camera=CAMERA, target_poses=beside, method="field"
+    )
+    assert there.values.shape == (1, 9, 18, 24)  # the camera of ms
+    with pytest.raises(InputError, match=r"frames \(1, 72, 96\), poses \(2, 4, 4\); expected"):
+        mmsynth.convert(field, torch.zeros(1, 72, 96), source="rgb", target="ms", poses=torch.zeros(2, 4, 4))
+    with pytest.raises(InputError, match=r"a frame of shape \(72, 96, 2\), expected \(72, 96\) of rgb"):
+        mmsynth.convert(field, torch.zeros(1, 2, 72, 96), source="rgb", target="ms", poses=torch.eye(4)[None], camera=CAMERA)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from analytic import AnalyticField, ring_pose, sphere
+from analytic import AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.operations.dataset import generate_dataset, verify
+from mmsynth.operations.coverage import training_rays
+from mmsynth.operations.dataset import FORMATS, generate_dataset
+from mmsynth.operations.dataset_index import verify
+from mmsynth.operations.flow import optical_flow
+from mmsynth.operations.share import Share, share_of_environment
 from mmsynth.operations.trajectories import View
 from mmsynth.scene.images import read_image
 from mmsynth.scene.poses import read_poses
@@ -25,7 +30,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("rig", ["aligned", "native"])
-@pytest.mark.parametrize("format", ["npz", "exr", "tiff"])
+@pytest.mark.parametrize("format", FORMATS)
 def test_complete_and_identical_on_rerun(tmp_path: Path, rig: str, format: str) -> None:
     field = AnalyticField(sphere())
     calls: list[tuple[int, int]] = []
@@ -34,9 +39,9 @@ def test_complete_and_identical_on_rerun(tmp_path: Path, rig: str, format: str) 
     assert calls[-1][0] == calls[-1][1] and calls == sorted(calls)
     stated = json.loads(path.read_text())
     assert set(stated["modalities"]) == {"rgb", "ms", "pol", "mono"} and stated["unit"] == "m" and len(stated["field"]) == 64
-    for view in stated["views"]:
+    for view in stated["views"] if format != "webdataset" else []:
         on_disk = {p.name for p in (tmp_path / "a" / view["folder"]).iterdir()}
-        assert on_disk == set(view["files"]) | {"view.json"}
+        assert on_disk == {name for name in view["files"] if "/" not in name} | {"view.json"}
     generate_dataset(field, views_of(field), tmp_path / "b", rig=rig, format=format)  # type: ignore[arg-type]
     assert content(tmp_path / "a") == content(tmp_path / "b")
 
@@ -100,6 +105,83 @@ def test_resumes(tmp_path: Path) -> None:
     assert renders(0.5) == 3  # another field
 
 
+@pytest.mark.parametrize("format", ["npz", "webdataset"])
+def test_processes_make_the_same_bytes_as_one(tmp_path: Path, format: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever comes last writes the summary; nobody waits, and a view at the border of two shares has its flow to the next."""
+    monkeypatch.setattr("mmsynth.operations.dataset.PER_SHARD", 2)
+    monkeypatch.setattr("mmsynth.operations.dataset_index.PER_SHARD", 2)
+    field: Any = AnalyticField(sphere())
+    generate_dataset(field, views_of(field, 5), tmp_path / "one", format=format)
+    written = [generate_dataset(field, views_of(field, 5), tmp_path / "many", format=format, share=Share(k, 3)) for k in (2, 0, 1)]
+    assert written == [None, None, tmp_path / "many/dataset.json"]
+    assert content(tmp_path / "one") == content(tmp_path / "many")
+    assert len(json.loads(written[2].read_text())["views"]) == 5 and verify(tmp_path / "many") == []  # type: ignore[union-attr]
+
+
+def test_shares_cover_everything_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for units, together, processes in [(10, 1, 3), (10, 4, 3), (3, 1, 8), (130, 64, 2), (0, 1, 2)]:
+        shares = [Share(k, processes).of(units, together) for k in range(processes)]
+        assert [i for share in shares for i in share] == list(range(units))
+        assert all(share.start % together == 0 for share in shares if len(share))
+    for rank, size, good in [("1", "4", True), ("4", "4", False), ("a", "2", False), ("-1", "2", False)]:
+        monkeypatch.setenv("RANK", rank)
+        monkeypatch.setenv("WORLD_SIZE", size)
+        if good:
+            assert share_of_environment() == Share(1, 4)
+        else:
+            with pytest.raises(InputError, match=f"RANK is '{rank}' and WORLD_SIZE '{size}'"):
+                share_of_environment()
+
+
+def test_a_shard_that_was_cut_off_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mmsynth.operations.dataset.PER_SHARD", 2)
+    monkeypatch.setattr("mmsynth.operations.dataset_index.PER_SHARD", 2)
+    field: Any = AnalyticField(sphere())
+    generate_dataset(field, views_of(field, 5), tmp_path / "whole", format="webdataset")
+    before = content(tmp_path / "whole")
+
+    def again(made: int) -> None:
+        counted = AnalyticField(sphere())
+        generate_dataset(counted, views_of(field, 5), tmp_path / "whole", format="webdataset")  # type: ignore[arg-type]
+        assert content(tmp_path / "whole") == before and counted.renders == made
+
+    again(0)
+    (tmp_path / "whole/shards/000001.json").unlink()
+    again(3)  # its two views, and the depth of the next for the flow
+    path = tmp_path / "whole/shards/000002.tar"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert [p for p in verify(tmp_path / "whole") if "000002.tar" in p]
+    again(1)
+    folder = tmp_path / "whole/views/0000"  # killed between the sidecar and the removal of the folders
+    folder.mkdir(parents=True)
+    (folder / "rgb.npz").write_bytes(b"left over")
+    again(0)
+
+
+def test_flow_coverage_and_what_was_asked_for(tmp_path: Path) -> None:
+    field: Any = AnalyticField(sphere())
+    views = views_of(field, 3)
+    rays = training_rays(field, scene_of(field, tmp_path / "scene", views=4, truth=False))
+    generate_dataset(field, views, tmp_path / "all", ["mono"], rays=rays)
+    seen = [field.render(*view[:2], ["mono"]) for view in views]
+    for i in range(2):
+        flow, occluded = optical_flow(*views[i][:2], seen[i].depth_ray, seen[i].normal, *views[i + 1][:2], seen[i + 1].depth_ray)
+        with np.load(tmp_path / f"all/views/{i:04d}/flow.npz") as arrays:
+            assert np.array_equal(arrays["flow"], flow, equal_nan=True) and np.array_equal(arrays["occluded"], occluded)
+    view = json.loads((tmp_path / "all/views/0001/view.json").read_text())
+    with np.load(tmp_path / "all/views/0001/geometry.npz") as arrays:
+        assert view["coverage_score"] == pytest.approx(np.nanmean(arrays["coverage"]), rel=1e-6) and 0 < view["coverage_score"] < 1
+        assert np.array_equal(np.isnan(arrays["coverage"]), np.isnan(arrays["depth_z"])) and not arrays["saturated_mono"].any()
+    generate_dataset(field, views, tmp_path / "few", ["mono"], outputs=[])
+    assert {p.name for p in (tmp_path / "few/views/0000").iterdir()} == {"mono.npz", "image.png", "view.json"}
+    generate_dataset(field, views, tmp_path / "flow", ["mono"], outputs=["flow"])
+    assert {p.name for p in (tmp_path / "flow/views/0000").iterdir()} == {"mono.npz", "flow.npz", "image.png", "view.json"}
+    # another next view: another flow, so another request
+    counted = AnalyticField(sphere())
+    generate_dataset(counted, [*views[:2], views[0]], tmp_path / "all", ["mono"], rays=rays)  # type: ignore[arg-type]
+    assert counted.renders == 2
+
+
 def test_verify_finds_damage(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     generate_dataset(field, views_of(field, 3), tmp_path)  # type: ignore[arg-type]
@@ -123,6 +205,8 @@ def test_refuses(tmp_path: Path) -> None:
         ({"format": "jpg"}, "npz, exr, tiff"),
         ({"modalities": ["thermal"]}, "'thermal'"),
         ({"modalities": []}, "no modalities"),
+        ({"outputs": ["masks"]}, "output 'masks', expected some of geometry, flow, coverage"),
+        ({"outputs": ["coverage"]}, "coverage needs the rays"),
     ]:
         with pytest.raises(InputError, match=message):
             generate_dataset(field, views, out, **arguments)  # type: ignore[arg-type]

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from analytic import RGB, ring_pose
+from analytic import MONO, RGB, ring_pose
+from conftest import look_at
+from scipy.ndimage import map_coordinates
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
 from mmsynth.fitting.poses import motion_of, rigid
 from mmsynth.operations.convert import convert_images
-from mmsynth.operations.register import landmarks, register
+from mmsynth.operations.register import Landmarks, landmarks, register
 from mmsynth.scene.images import write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Split
-from mmsynth.sensors.camera import Camera, project
+from mmsynth.sensors.camera import Camera, project, ray_map
 from mmsynth.sensors.mosaic import mosaic
 
 CAMERA = Camera(160, 120, 170.0, 170.0, 79.2, 59.8, (-0.08, 0.02, 0.001, -0.001))
@@ -67,6 +70,46 @@ def test_a_frame_is_found_to_a_fraction_of_a_pixel(field: Field, scene: Scene) -
         off = motion_of((np.linalg.inv(pose) @ found.pose)[None])[0]
         assert (np.abs(off) < 6 * np.sqrt(np.diag(found.covariance)) + 1e-5).all()
         assert found.sd_px < 0.1 and found.inliers > 50 and found.exposure == pytest.approx(exposure, rel=0.03)
+
+
+class BoardField:
+    """A ChArUco board that lies on z = 0, from the origin to (0.7, 0.5), on grey: squares that all look alike."""
+
+    region = Region((0.35, 0.25, 0.0), 0.6)
+    sensors: ClassVar = {"mono": MONO}
+    board = cv2.aruco.CharucoBoard((7, 5), 0.1, 0.075, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
+    drawn = cv2.GaussianBlur(board.generateImage((700, 500)).astype(np.float32) / 255, (0, 0), 1.5)
+
+    def pose_of(self, frame: Frame) -> np.ndarray:
+        return frame.camera_to_world
+
+    def cast(self, directions: np.ndarray, pose: np.ndarray, names: list[str], geometry: bool) -> dict[str, np.ndarray]:
+        ray = directions @ pose[:3, :3].T
+        depth = np.where(ray[:, 2] < 0, -pose[2, 3] / np.minimum(ray[:, 2], -1e-9), np.nan)
+        u, v = ((pose[:2, 3] + depth[:, None] * ray[:, :2]).T * 1000.0).astype(np.float32)
+        light = map_coordinates(self.drawn, [499.5 - v, u - 0.5], order=1, mode="constant", cval=0.3)
+        return {"mono": light.reshape(-1, 1), "depth": depth / self.region.radius}
+
+
+def test_markers_tell_squares_that_look_alike_apart(tmp_path: Path) -> None:
+    field: Any = BoardField()
+    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5, (-0.05, 0.01, 0.0, 0.0))
+    at = lambda angle: look_at((0.35 + 0.8 * np.cos(angle), 0.25 + 0.8 * np.sin(angle), 0.9), (0.35, 0.25, 0.0))
+    shot = lambda pose: field.cast(ray_map(camera)[0].reshape(-1, 3), pose, ["mono"], False)["mono"].reshape(240, 320, 1)
+    frames = []
+    for view in range(6):
+        write_png16(tmp_path / f"{view}.png", shot(at(view)))
+        frames.append(Frame("mono", view, tmp_path / f"{view}.png", camera, at(view)))
+    known = landmarks(
+        field, Scene(tmp_path, "test", field.sensors, tuple(frames), field.region, Split(tuple(range(6)), (), ""), "m"), "mono"
+    )
+    assert len(known.markers) > 40
+    pose = at(2.5) @ rigid(np.array([[0.02, -0.03, 0.4, 0.05, 0.0, 0.1]]))[0]
+    found = register(field, Landmarks([], known.markers), shot(pose), camera, "mono")
+    np.testing.assert_allclose(found.pose, pose, atol=2e-3)
+    assert found.inliers > 40
+    with pytest.raises(InputError, match="0 features agree"):
+        register(field, Landmarks([], {}), shot(pose), camera, "mono")
 
 
 @pytest.mark.parametrize("what", ["noise", "nothing", "another"])
