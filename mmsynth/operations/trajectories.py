@@ -1,7 +1,8 @@
 """Where to render from: poses files and generated camera paths.
 
 A view is ``(camera, camera_to_world, name)``: intrinsics with lens, (4, 4) float64 pose with OpenCV axes in the scene's world frame
-and unit, and a name. Generated paths turn around the region of interest and look at its centre; up is the training cameras' mean up.
+and unit, and a name. Generated paths turn around the region of interest and look at its centre (up is the training cameras' mean up), or
+follow the training poses.
 """
 
 from __future__ import annotations
@@ -123,16 +124,36 @@ def _perturb(
     return out
 
 
-def _number(spec: Mapping[str, Any], key: str, default: float, low: float, high: float, where: str) -> float:
-    value = spec.get(key, default)
+def _directions(kind: str, spec: Mapping[str, Any], where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth [rad] and sine of the elevation of a path on a sphere, (V,) each."""
+    views = _whole(spec, "views", 1, 100_000, where)
+    steps = np.arange(views)
+    if kind == "orbit":
+        elevation = np.radians(_number(spec, "elevation_deg", -90.0, 90.0, where))
+        return 2 * np.pi * steps / views, np.full(views, np.sin(elevation))
+    lowest = _number(spec, "min_elevation_deg", -90.0, 90.0 if kind == "spiral" else 89.0, where)
+    if kind == "hemisphere":
+        golden_angle = np.pi * (3.0 - np.sqrt(5.0))
+        floor = np.sin(np.radians(lowest))
+        return golden_angle * steps, floor + (1.0 - floor) * (steps + 0.5) / views
+    highest = _number(spec, "max_elevation_deg", -90.0, 90.0, where)
+    if lowest > highest:
+        raise InputError(f"{where}: key 'max_elevation_deg' is {highest:g}, expected at least 'min_elevation_deg', {lowest:g}.")
+    share = np.linspace(0.0, 1.0, views)
+    turns = _number(spec, "turns", -1000.0, 1000.0, where)
+    return 2 * np.pi * turns * share, np.sin(np.radians(lowest + (highest - lowest) * share))
+
+
+def _number(spec: Mapping[str, Any], key: str, low: float, high: float, where: str) -> float:
+    value = spec[key]
     good = isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value)
     if not good or not low <= value <= high:
         raise InputError(f"{where}: key '{key}' is {value!r}, expected a number from {low:g} to {high:g}.")
     return float(value)
 
 
-def _whole(spec: Mapping[str, Any], key: str, default: int, low: int, high: int, where: str) -> int:
-    value = _number(spec, key, default, low, high, where)
+def _whole(spec: Mapping[str, Any], key: str, low: int, high: int, where: str) -> int:
+    value = _number(spec, key, low, high, where)
     if value != int(value):
         raise InputError(f"{where}: key '{key}' is {value}, expected a whole number.")
     return int(value)
@@ -165,38 +186,22 @@ def trajectory_views(
     unknown = [key for key in spec if key != "trajectory" and key not in allowed]
     if unknown:
         raise InputError(f"{where}: unknown key '{unknown[0]}', expected one of {', '.join(allowed)} for '{kind}'.")
-    read = lambda key, low, high: _number(spec, key, allowed[key], low, high, where)
+    spec = {**allowed, **spec}
     distances = [float(np.linalg.norm(pose[:3, 3] - region.centre)) for pose in training]
     reach = float(np.median(distances)) if distances and np.median(distances) > 0 else 3.0 * region.radius
-    if kind == "perturb":
-        if not training:
-            raise InputError(f"{where}: no training poses, expected at least 1 to perturb.")
-        per_pose, seed = _whole(spec, "per_pose", allowed["per_pose"], 1, 10_000, where), _whole(spec, "seed", 0, 0, 2**53, where)
-        rotation, translation = np.radians(read("rotation_deg", 0.0, 180.0)), read("translation", 0.0, 10.0)
-        poses = _perturb(per_pose, rotation, translation, seed, region, training)
-        return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
-    views = _whole(spec, "views", allowed["views"], 1, 100_000, where)
+    if kind in ("interpolate", "perturb"):
+        least = 2 if kind == "interpolate" else 1
+        if len(training) < least:
+            raise InputError(f"{where}: {len(training)} training poses, expected at least {least} to {kind}.")
     if kind == "interpolate":
-        if len(training) < 2:
-            raise InputError(f"{where}: {len(training)} training poses, expected at least 2 to interpolate.")
-        poses = _interpolate(views, training, reach)
+        poses = _interpolate(_whole(spec, "views", 1, 100_000, where), training, reach)
+    elif kind == "perturb":
+        per_pose, seed = _whole(spec, "per_pose", 1, 10_000, where), _whole(spec, "seed", 0, 2**53, where)
+        rotation, translation = _number(spec, "rotation_deg", 0.0, 180.0, where), _number(spec, "translation", 0.0, 10.0, where)
+        poses = _perturb(per_pose, np.radians(rotation), translation, seed, region, training)
     else:
-        radius = reach if spec.get("radius") is None else _number(spec, "radius", reach, 1e-9, 1e9, where)
-        steps = np.arange(views)
-        if kind == "orbit":
-            elevation = np.radians(read("elevation_deg", -90.0, 90.0))
-            azimuth, sine = 2 * np.pi * steps / views, np.full(views, np.sin(elevation))
-        elif kind == "spiral":
-            lowest, highest = read("min_elevation_deg", -90.0, 90.0), read("max_elevation_deg", -90.0, 90.0)
-            if lowest > highest:
-                raise InputError(f"{where}: key 'max_elevation_deg' is {highest:g}, expected at least 'min_elevation_deg', {lowest:g}.")
-            share = np.linspace(0.0, 1.0, views)
-            azimuth = 2 * np.pi * read("turns", -1000.0, 1000.0) * share
-            sine = np.sin(np.radians(lowest + (highest - lowest) * share))
-        else:
-            floor = np.sin(np.radians(read("min_elevation_deg", -90.0, 89.0)))
-            golden_angle = np.pi * (3.0 - np.sqrt(5.0))
-            azimuth, sine = golden_angle * steps, floor + (1.0 - floor) * (steps + 0.5) / views
+        azimuth, sine = _directions(kind, spec, where)
+        radius = reach if spec["radius"] is None else _number(spec, "radius", 1e-9, 1e9, where)
         poses = _around(azimuth, sine, radius, region, training)
     return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
 
@@ -213,12 +218,12 @@ def reference_camera(field: Field) -> Camera:
     raise InputError("field: it stores no camera, expected poses with intrinsics.")
 
 
-def training_poses(scene: Scene) -> list[np.ndarray]:
-    """(4, 4) poses of the reference sensor's training views, in view order."""
+def training_poses(field: Field, scene: Scene) -> list[np.ndarray]:
+    """(4, 4) poses of the reference sensor's training views, in view order, as the fit corrected them."""
     for name in scene.sensors:
         frames = scene.frames_of(name, scene.split.train)
         if frames:
-            return [frame.camera_to_world for frame in frames]
+            return [field.pose_of(frame) for frame in frames]
     return []
 
 
@@ -237,7 +242,7 @@ def load_views(path: Path | str, field: Field, scene: Scene | None = None, senso
     if path.suffix.lower() == ".json":
         content = read_json(path)
         if isinstance(content, dict) and "trajectory" in content:
-            training = training_poses(scene) if scene is not None else []
+            training = training_poses(field, scene) if scene is not None else []
             return trajectory_views(content, field.region, own or reference_camera(field), training, str(path))
     poses = read_poses(path)
     fallback = own or reference_camera(field) if any(camera is None for camera, _, _ in poses) else None

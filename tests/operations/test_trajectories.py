@@ -15,7 +15,7 @@ from scipy.stats import kstest
 
 from mmsynth.errors import InputError
 from mmsynth.operations.trajectories import load_views, look_at, trajectory_views, world_up
-from mmsynth.scene.scene import Region
+from mmsynth.scene.scene import Frame, Region
 from mmsynth.sensors.camera import Camera
 
 CAMERA = Camera(24, 18, 26.0, 26.0, 11.5, 8.5)
@@ -182,8 +182,22 @@ def test_refuses(spec: dict[str, Any], message: str) -> None:
 
 
 def test_perturb_needs_training_poses() -> None:
-    with pytest.raises(InputError, match="no training poses, expected at least 1 to perturb"):
+    with pytest.raises(InputError, match="0 training poses, expected at least 1 to perturb"):
         trajectory_views({"trajectory": "perturb"}, REGION, CAMERA, [])
+
+
+def test_training_poses_are_those_of_the_fit(tmp_path: Path) -> None:
+    """Where a fit corrected the input's poses, paths through them go by the corrected ones."""
+
+    class Corrected(AnalyticField):
+        def pose_of(self, frame: Frame) -> np.ndarray:
+            return moved(frame.camera_to_world)
+
+    field = Corrected(sphere(), [RGB])
+    scene = scene_of(field, tmp_path / "scene", truth=False)
+    (tmp_path / "path.json").write_text(json.dumps({"trajectory": "perturb", "per_pose": 1, "rotation_deg": 0, "translation": 0}))
+    found = [pose for _, pose, _ in load_views(tmp_path / "path.json", field, scene)]  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, [moved(ring_pose(view, 4)) for view in range(3)], atol=1e-12)
 
 
 def test_load_views(tmp_path: Path) -> None:
