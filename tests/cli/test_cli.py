@@ -155,17 +155,9 @@ def test_generate_dataset_leaves_out_what_no_frame_saw(fitted: Path, tmp_path: P
 
 def test_two_processes_make_the_dataset_of_one(fitted: Path, tmp_path: Path) -> None:
     (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 5}))
-    command = (
-        "generate-dataset",
-        "--poses",
-        str(tmp_path / "orbit.json"),
-        "--modalities",
-        "mono,nir",
-        "--sensor",
-        "bayer_rgb",
-        "--seed",
-        "3",
-    )
+    (tmp_path / "nir.toml").write_text(MONO_TOML)
+    few = ("--modalities", "mono,nir", "--outputs", "geometry,flow", "--sensor", str(tmp_path / "nir.toml"), "--seed", "3")
+    command = ("generate-dataset", "--poses", str(tmp_path / "orbit.json"), *few)
     assert run(fitted, *command, "--out", str(tmp_path / "one")).returncode == 0
     outputs = []
     for rank in ("1", "0"):
