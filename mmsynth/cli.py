@@ -300,7 +300,7 @@ def convert(
     with _bar(f"{a} to {b}", as_json) as show:
         if poses is not None:
             at = load_views(_poses_file(poses, scene.root), field, scene, a)
-            written = convert_at_poses(field, a, b, at, destination, images or [], method, as_sensor, file_format, show)
+            written = convert_at_poses(field, scene, a, b, at, destination, images or [], method, as_sensor, file_format, show)
         elif images:
             written = convert_images(field, scene, a, b, images, destination, method, as_sensor, file_format, show)
         else:

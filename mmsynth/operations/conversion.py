@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
+from mmsynth.operations.coverage import TrainingRays, coverage
 from mmsynth.operations.guidance import Guide, contrast, guide, linear_map
 from mmsynth.scene.scene import Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera, project, ray_map
@@ -43,7 +44,8 @@ class Converted:
     Attributes:
         method: the one used. values: (H, W, K) float32, NaN where the lens has no ray. stokes: (H, W, 3) of a polarization target.
         confidence: (H, W) float32 in [0, 1]: exp(-½ (σ / 0.1)²) with σ the relative standard deviation of the gain, 0 where the lens has no
-            ray or the frame shows what the field does not have. guided: (H, W) bool, where the frame had a say.
+            ray or the frame shows what the field does not have; of ``render_frame``, coverage.
+        guided: (H, W) bool, where the frame had a say.
         exposure: of the source frame, in units of the frames that the field learned from. opacity, valid: of the rendering.
     """
 
@@ -187,14 +189,23 @@ def convert_frame(
     return _put_together(field, target, used, there, maps, visible & (carried[..., -2] > 0.99) & ~strange, strange, hint)
 
 
-def render_frame(field: Field, camera: Camera, pose: np.ndarray, target: str, progress: Callable[[int], None] | None = None) -> Converted:
-    """What the target sensor would have seen at a pose where there is no frame: the field alone."""
-    seen = field.render(camera, pose, [target], geometry=False, progress=progress)
+def render_frame(
+    field: Field,
+    rays: TrainingRays,
+    camera: Camera,
+    pose: np.ndarray,
+    target: str,
+    progress: Callable[[int], None] | None = None,
+) -> Converted:
+    """What the target sensor would have seen at a pose where there is no frame: the field alone. Confidence is coverage by the training
+    frames (see ``coverage``), 0 without a surface."""
+    seen = field.render(camera, pose, [target], geometry=True, progress=progress)
+    covered = coverage(rays, camera, pose, seen.depth_ray, seen.normal)
     return Converted(
         method="field",
         values=seen.channels[target],
         stokes=seen.stokes.get(target),
-        confidence=np.where(seen.valid, 1.0, 0.0).astype(np.float32),
+        confidence=np.where(np.isfinite(covered), covered, 0.0).astype(np.float32),
         guided=np.zeros_like(seen.valid),
         exposure=1.0,
         opacity=seen.opacity,

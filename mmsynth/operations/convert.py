@@ -14,6 +14,7 @@ from mmsynth.errors import InputError
 from mmsynth.files import write_json
 from mmsynth.operations import previews
 from mmsynth.operations.conversion import Converted, chosen_method, convert_frame, render_frame
+from mmsynth.operations.coverage import TrainingRays, training_rays
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.operations.records import CONVENTIONS, FORMATS, UNITS, camera_json, modality_arrays, sensor_json, write_record
 from mmsynth.operations.register import landmarks, register
@@ -139,6 +140,7 @@ def convert_images(
 
 def convert_at_poses(
     field: Field,
+    scene: Scene,
     source: str,
     target: str,
     views: Sequence[View],
@@ -164,7 +166,7 @@ def convert_at_poses(
         if method not in ("auto", "field"):
             raise InputError(f"convert: method '{method}' needs frames of {source}, expected images at the poses, or the method field.")
         plain = [_Item(_plain_name(name), camera, pose, places(pose)) for camera, pose, name in views]
-        return _convert_each(field, source, target, plain, Path(out), "field", format, progress)
+        return _convert_each(field, source, target, plain, Path(out), "field", format, progress, training_rays(field, scene))
     _check_names(images)
     known = {_plain_name(name): (camera, pose) for camera, pose, name in views}
     items = []
@@ -209,7 +211,15 @@ class _Item:
 
 
 def _convert_each(
-    field: Field, source: str, target: str, items: Sequence[_Item], out: Path, method: str, format: str, progress: Progress | None
+    field: Field,
+    source: str,
+    target: str,
+    items: Sequence[_Item],
+    out: Path,
+    method: str,
+    format: str,
+    progress: Progress | None,
+    rays: TrainingRays | None = None,
 ) -> list[Path]:
     sensor, folder = field.sensors[target], out / target
     if not items:
@@ -217,14 +227,16 @@ def _convert_each(
     if format not in FORMATS:
         raise InputError(f"convert: format is {format!r}, expected one of {', '.join(FORMATS)}.")
     used = chosen_method(method, field.sensors[source], sensor)
-    rays = [sum(c.width * c.height for c in (i.camera, *(() if i.seen_by is None else (i.seen_by[0],)))) for i in items]
-    count = Counter(progress, sum(rays))
+    costs = [sum(c.width * c.height for c in (i.camera, *(() if i.seen_by is None else (i.seen_by[0],)))) for i in items]
+    count = Counter(progress, sum(costs))
     written: list[Path] = []
     exposure: float | None = None
-    for item, cost in zip(items, rays, strict=True):
+    for item, cost in zip(items, costs, strict=True):
         goal = count.done + cost
         if item.read is None:
-            found = render_frame(field, *(item.seen_by or (item.camera, item.pose)), target, progress=count)
+            assert rays is not None
+            camera, pose = item.seen_by or (item.camera, item.pose)
+            found = render_frame(field, rays, camera, pose, target, progress=count)
         else:
             found = convert_frame(field, item.read(), item.camera, item.pose, source, target, used, item.seen_by, progress=count)
         count(goal - count.done)

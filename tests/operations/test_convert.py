@@ -14,6 +14,7 @@ from analytic import RGB, AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
 from mmsynth.operations.convert import convert_at_poses, convert_frames
+from mmsynth.operations.coverage import coverage, training_rays
 from mmsynth.operations.records import read_record
 from mmsynth.scene.images import read_image, write_png16
 from mmsynth.sensors.mosaic import mosaic
@@ -83,17 +84,23 @@ def test_refuses(tmp_path: Path, source: str, target: str, views: list[int] | No
 def test_at_given_poses(tmp_path: Path, format: str) -> None:
     """The field alone where there is no frame; the frame has its say where there is one, found by its name."""
     field: Any = AnalyticField(sphere())
+    scene = scene_of(field, tmp_path / "scene", views=3, truth=False)
     camera = field.cameras["rgb"]
     views = [(camera, ring_pose(i, 9), f"images/shot{i}.jpg") for i in range(3)]
-    convert_at_poses(field, "rgb", "ms", views, tmp_path / "plain", format=format)
+    rays = training_rays(field, scene)
+    convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "plain", format=format)
     for i in range(3):
         facts = json.loads((tmp_path / f"plain/ms/shot{i}.json").read_text())
         assert facts["method"] == "field" and facts["frame"] is None and facts["guided"] == 0
         back = read_record(tmp_path / "plain/ms", facts["files"], f"shot{i}")
+        seen = field.render(camera, ring_pose(i, 9), [])
+        covered = coverage(rays, camera, ring_pose(i, 9), seen.depth_ray, seen.normal)
+        np.testing.assert_allclose(back["confidence"], np.where(np.isnan(covered), 0.0, covered), atol=1e-6)
+        assert (np.nanmean(covered) > 0.94) == (i == 0)  # a training pose
         np.testing.assert_allclose(back["data"], field.render(camera, ring_pose(i, 9), ["ms"]).channels["ms"], atol=1 / 65535)
     raw = mosaic(torch.from_numpy(field.render(camera, ring_pose(1, 9), ["rgb"]).channels["rgb"]).movedim(-1, 0), RGB.mosaic)  # type: ignore[arg-type]
     write_png16(tmp_path / "shot1.png", 0.5 * raw.numpy())
-    convert_at_poses(field, "rgb", "ms", views, tmp_path / "seen", [tmp_path / "shot1.png"], as_sensor=True, format=format)
+    convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "seen", [tmp_path / "shot1.png"], as_sensor=True, format=format)
     assert [p.stem for p in (tmp_path / "seen/ms").glob("*.json")] == ["shot1"]
     facts = json.loads((tmp_path / "seen/ms/shot1.json").read_text())
     assert facts["method"] == "guided" and facts["frame_exposure"] == pytest.approx(0.5, rel=1e-3)
@@ -102,6 +109,7 @@ def test_at_given_poses(tmp_path: Path, format: str) -> None:
 
 def test_refuses_poses_that_do_not_fit(tmp_path: Path) -> None:
     field: Any = AnalyticField(sphere())
+    scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
     views = [(field.cameras["rgb"], ring_pose(0, 9), "0000")]
     for arguments, message in [
         ({"method": "ratio"}, "method 'ratio' needs frames of rgb"),
@@ -111,8 +119,8 @@ def test_refuses_poses_that_do_not_fit(tmp_path: Path) -> None:
         ({"images": [tmp_path / "0000.png", tmp_path / "a" / "0000.png"]}, "two images have one name"),
     ]:
         with pytest.raises(InputError, match=message):
-            convert_at_poses(field, "rgb", "ms", views, tmp_path / "out", **arguments)  # type: ignore[arg-type]
+            convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "out", **arguments)  # type: ignore[arg-type]
     del field.rig["ms"]
     with pytest.raises(InputError, match="'ms' has no known place on the rig of 'rgb'"):
-        convert_at_poses(field, "rgb", "ms", views, tmp_path / "out", as_sensor=True)
+        convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "out", as_sensor=True)
     assert not (tmp_path / "out").exists()
