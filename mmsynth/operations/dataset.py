@@ -249,8 +249,10 @@ def _following(
     """depth_ray of the next view, by group: rendered now and kept, where it is still to be made, else read from what was made."""
     if "flow" not in plan.outputs or index + 1 == len(plan.placed):
         return None
-    made = finished_view(plan.out, index + 1, plan.keys[index + 1])
-    if made is not None and "geometry" in plan.outputs:
+    # folders of another process may go into a shard at any time
+    readable = "geometry" in plan.outputs and (mine or plan.format != "webdataset")
+    made = finished_view(plan.out, index + 1, plan.keys[index + 1]) if readable else None
+    if made is not None:
         folder = plan.out / view_folder(index + 1)
         return [read_record(folder, made["files"], _of("geometry", group[0], plan.rig))["depth_ray"] for group in plan.groups]
     if mine and plan.finished(index + 1) is None:
@@ -325,11 +327,13 @@ def _summary(plan: _Plan, raw: Path | None) -> Path | None:
     out, views = plan.out, []
     shards: dict[str, dict[str, Any]] = {}
     for index in range(len(plan.placed)):
-        stated = plan.finished(index)
+        # another process may have its views and not yet their shard
+        shard = plan.shard(index) if plan.format == "webdataset" else None
+        stated = shard[index % PER_SHARD] if shard else plan.finished(index) if plan.format != "webdataset" else None
         if stated is None:
             return None
         where = {"folder": view_folder(index)}
-        if plan.format == "webdataset":
+        if shard:
             where = {"shard": shard_name(index), "key": f"{index:04d}"}
             path = out / shard_name(index)
             shards[shard_name(index)] = shards.get(shard_name(index)) or {"sha256": sha256_of(path), "bytes": path.stat().st_size}

@@ -118,6 +118,21 @@ def test_processes_make_the_same_bytes_as_one(tmp_path: Path, format: str, monke
     assert len(json.loads(written[2].read_text())["views"]) == 5 and verify(tmp_path / "many") == []  # type: ignore[union-attr]
 
 
+def test_views_whose_shard_is_still_to_come_are_not_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process has rendered its views and is about to pack them."""
+    monkeypatch.setattr("mmsynth.operations.dataset.PER_SHARD", 2)
+    monkeypatch.setattr("mmsynth.operations.dataset_index.PER_SHARD", 2)
+    field: Any = AnalyticField(sphere())
+    make = lambda out, **how: generate_dataset(field, views_of(field, 4), out, format="webdataset", **how)
+    make(tmp_path / "one")
+    with monkeypatch.context() as late:
+        late.setattr("mmsynth.operations.dataset.pack_shard", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            make(tmp_path / "two", share=Share(0, 2))
+    assert make(tmp_path / "two", share=Share(1, 2)) is None
+    assert make(tmp_path / "two", share=Share(0, 2)) is not None and content(tmp_path / "one") == content(tmp_path / "two")
+
+
 def test_shares_cover_everything_once(monkeypatch: pytest.MonkeyPatch) -> None:
     for units, together, processes in [(10, 1, 3), (10, 4, 3), (3, 1, 8), (130, 64, 2), (0, 1, 2)]:
         shares = [Share(k, processes).of(units, together) for k in range(processes)]
