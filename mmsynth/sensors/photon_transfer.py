@@ -137,7 +137,8 @@ def photon_transfer_of_frames(
     Standard deviations are by blocks of 32 x 32 photosites (sandwich estimator): differences share photosites, and what is wrong in one
     place is wrong around it; to which comes what plainer surfaces say differently. Fine texture that the model does not see still counts
     as noise: where all that is bright has it, the gain is too large, by up to a sixth, and the read noise too small, by up to two fifths,
-    and the deviations do not tell. Frames that were rendered from another field have such grain everywhere: gains up to 1.8 times too large.
+    and the deviations do not tell. Frames that were rendered from another field have such grain everywhere: gains 1.2 to 1.8
+    times too large.
 
     Args:
         frames: raw (H, W) and expected (H, W, C), all channels at every pixel, DN, black level included; NaN where unknown.
