@@ -115,7 +115,7 @@ def generate_dataset(
                 pack_shard(plan.out, shard_name(index), range(first, index + 1))
                 plan.shard(index)
     raw = simulate(field, sensors, views, plan.out / "raw", seed, rig=rig, share=share, progress=progress) if sensors else None
-    return None if sensors and raw is None else _summary(plan, raw)
+    return None if sensors and raw is None else _summary(plan, raw, seed)
 
 
 @dataclass(frozen=True)
@@ -322,8 +322,8 @@ def _geometry_arrays(rendering: Rendering, pose: np.ndarray) -> dict[str, np.nda
     }
 
 
-def _summary(plan: _Plan, raw: Path | None) -> Path | None:
-    """Write what stands above the views, once all of them are there; raw: the meta_data.json of their raw frames."""
+def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
+    """Write what stands above the views, once all of them are there; raw: the meta_data.json of their raw frames, seed: of their noise."""
     out, views = plan.out, []
     shards: dict[str, dict[str, Any]] = {}
     for index in range(len(plan.placed)):
@@ -349,7 +349,10 @@ def _summary(plan: _Plan, raw: Path | None) -> Path | None:
     if raw is not None:
         files += [raw, *(path for kind in ("modalities", "sensors", "sidecars") for path in sorted((raw.parent / kind).rglob("[!.]*.*")))]
     listed = {str(path.relative_to(out)): {"sha256": sha256_of(path), "bytes": path.stat().st_size} for path in files}
-    write_json(out / "dataset.json", {**plan.request, "files": listed} | ({"shards": shards} if shards else {}) | {"views": views})
+    write_json(
+        out / "dataset.json",
+        {**plan.request, "files": listed} | ({"raw_seed": seed} if raw else {}) | ({"shards": shards} if shards else {}) | {"views": views},
+    )
     return out / "dataset.json"
 
 
