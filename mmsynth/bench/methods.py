@@ -1,6 +1,6 @@
 """Ways to compute something, timed beside each other: speed against error.
 
-Speeds are medians of repeats in which the methods of one problem take turns, on one thread, per element.
+Speeds are medians of repeats in which the methods of one problem take turns, per element; on one thread unless a bench says otherwise.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ def measured(
     return measured_methods([m for name, family in known.items() if only is None or name in only for m in family()], repeats, progress)
 
 
-def measured_methods(methods: Sequence[Method], repeats: int, progress: Progress | None) -> list[dict[str, Any]]:
+def measured_methods(methods: Sequence[Method], repeats: int, progress: Progress | None, threads: int = 1) -> list[dict[str, Any]]:
     """One row per method."""
     rows, groups = [], _groups(methods)
-    threads = cv2.getNumThreads()
+    before = cv2.getNumThreads()
     try:
-        cv2.setNumThreads(1)
-        with use_threads(1):
+        cv2.setNumThreads(threads)
+        with use_threads(threads):
             for done, group in enumerate(groups, 1):
                 rows += _measured(group, repeats)
                 if progress is not None:
                     progress(done, len(groups))
     finally:
-        cv2.setNumThreads(threads)
+        cv2.setNumThreads(before)
     return rows
 
 
@@ -80,19 +80,22 @@ def _groups(methods: Sequence[Method]) -> list[list[Method]]:
 
 
 def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
+    """``cores``: CPU time per time, what of a shared machine the method got."""
     times: list[list[float]] = [[] for _ in group]
+    worked = [0.0] * len(group)
     judged = [method.judge(method.run()) for method in group]
     for _ in range(repeats):
-        for method, taken in zip(group, times, strict=True):
-            began = time.perf_counter()
+        for i, method in enumerate(group):
+            began, work = time.perf_counter(), time.process_time()
             method.run()
-            taken.append(time.perf_counter() - began)
+            times[i].append(time.perf_counter() - began)
+            worked[i] += time.process_time() - work
     return [
         {
             "family": method.family, "problem": method.problem, "method": method.name, "unit": method.unit,
-            "ns": statistics.median(taken) / method.count * 1e9, **found,
+            "ns": statistics.median(taken) / method.count * 1e9, "cores": work / sum(taken), **found,
         }
-        for method, taken, found in zip(group, times, judged, strict=True)
+        for method, taken, work, found in zip(group, times, worked, judged, strict=True)
     ]  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import analyser_axes
 
+TILE = 8192  # rays at a time: what they need stays in the caches
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
 
@@ -181,9 +182,16 @@ class Field(nn.Module):
         self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
         """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth, normal."""
-        rays = len(origins)
-        jitter = torch.full((rays,), 0.5, device=origins.device)
+        jitter = torch.full((len(origins),), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
+        return self.shown(hits, origins, directions, camera_x, modalities, geometry)
+
+    @torch.no_grad()
+    def shown(
+        self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
+    ) -> dict[str, Tensor]:
+        """What rays show that met ``hits``: see ``render_rays``."""
+        rays = len(origins)
         features, opacity = self.to_shade(hits)
         opacity = opacity[:, None]
         outputs = {d: self.shader(features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
@@ -217,10 +225,13 @@ class Field(nn.Module):
 
     def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
         """``render_rays`` of rays of one camera: directions (R, 3) in its axes, scene frame; depth stays in radii."""
+        return {k: x.cpu().numpy() for k, x in self.render_rays(*self.placed(directions, camera_to_world), modalities, geometry).items()}
+
+    def placed(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""
         turned = torch.from_numpy((directions @ camera_to_world[:3, :3].T).astype(np.float32)).to(self.device)
         origin = self.to_normalised(camera_to_world[:3, 3]).expand(len(turned), 3)
-        camera_x = torch.from_numpy(camera_to_world[:3, 0].astype(np.float32)).to(self.device).expand(len(turned), 3)
-        return {key: value.cpu().numpy() for key, value in self.render_rays(origin, turned, camera_x, modalities, geometry).items()}
+        return origin, turned, torch.from_numpy(camera_to_world[:3, 0].astype(np.float32)).to(self.device).expand(len(turned), 3)
 
     def render(
         self,
@@ -248,8 +259,8 @@ class Field(nn.Module):
         rows = np.flatnonzero(valid)
         directions = in_camera.reshape(-1, 3)[rows]
         parts: dict[str, list[np.ndarray]] = {}
-        for start in range(0, len(directions), 8192):
-            part = directions[start : start + 8192]
+        for start in range(0, len(directions), TILE):
+            part = directions[start : start + TILE]
             for key, value in self.cast(part, pose, names, geometry).items():
                 parts.setdefault(key, []).append(value)
             if progress is not None:

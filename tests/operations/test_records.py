@@ -73,6 +73,9 @@ def _of(sensor: Sensor) -> dict[str, np.ndarray]:
 
 
 def test_cameras_come_back() -> None:
-    for camera in (Camera(4, 3, 5.0, 6.0, 1.5, 1.0, (0.1, 0.2, 0.0, 0.01)), Camera(4, 3, 5.0, 6.0, 1.5, 1.0, (0.1, 0.0, 0.0, 0.0), "kannala_brandt")):
+    for camera in (
+        Camera(4, 3, 5.0, 6.0, 1.5, 1.0, (0.1, 0.2, 0.0, 0.01)),
+        Camera(4, 3, 5.0, 6.0, 1.5, 1.0, (0.1, 0.0, 0.0, 0.0), "kannala_brandt"),
+    ):
         again, pose = camera_from_json(camera_json(camera, np.diag([1.0, -1.0, -1.0, 1.0])))
         assert again == camera and np.array_equal(pose, np.diag([1.0, -1.0, -1.0, 1.0]))
