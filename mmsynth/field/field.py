@@ -25,7 +25,7 @@ from mmsynth.field.surface import Surface
 from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
-from mmsynth.sensors.polarization import analyser_axes
+from mmsynth.sensors.polarization import reference_axes
 
 TILE = 8192  # rays at a time: what they need stays in the caches
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
@@ -191,7 +191,6 @@ class Field(nn.Module):
         self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
-        rays = len(origins)
         features, opacity = self.to_shade(hits)
         opacity = opacity[:, None]
         outputs = {d: self.shader(features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
@@ -204,12 +203,10 @@ class Field(nn.Module):
             if angles is None:
                 out[name] = opacity * self.shader.values(name, outputs[self.view_dependence[name]])
                 continue
-            degrees = torch.tensor((*angles, 0.0, 45.0, 90.0), device=origins.device)
-            axes = analyser_axes(directions, camera_x, torch.deg2rad(degrees).expand(rays, -1))
-            behind_analysers = opacity * self.shader.values(name, outputs[self.view_dependence[name]], axes)
-            out[name] = behind_analysers[:, :-3]
-            i0, i45, i90 = behind_analysers[:, -3:].unbind(1)
-            out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
+            x, y = reference_axes(directions, camera_x)
+            turned = torch.deg2rad(torch.tensor(angles, device=origins.device))
+            light = self.shader.polarized(name, outputs[self.view_dependence[name]], x, y, turned)
+            out[name], out[f"stokes/{name}"] = (opacity * part for part in light)
         if geometry:
             depth = hits.depth
             hit = torch.nonzero(torch.isfinite(depth))[:, 0]

@@ -16,7 +16,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.radiance import Shader, intensity, radiance
 from mmsynth.scene.scene import Region, Sensor
-from mmsynth.sensors.polarization import coherency_from_factor
+from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
 
 RGB = Sensor("rgb", ("R", "G", "B"), (None, None, None))
 POL = Sensor("pol", ("0", "45", "90", "135"), (None,) * 4, None, (0.0, 45.0, 90.0, 135.0))
@@ -139,11 +139,14 @@ def test_modalities_have_their_own_outputs() -> None:
     outputs = torch.randn(5, 10, requires_grad=True)
     torch.testing.assert_close(shader.values("rgb", outputs), 0.5 * softplus(outputs[:, :3]))
     torch.testing.assert_close(shader.values("nir", outputs), 2.0 * softplus(outputs[:, 9:]))
-    axes = normalize(torch.randn(5, 2, 3), dim=-1)
-    j = coherency_from_factor(outputs[:, 3:9])
-    expected = 0.25 * torch.einsum("rki,rij,rkj->rk", axes, j @ j.mT, axes)
-    torch.testing.assert_close(shader.values("pol", outputs, axes), expected)
-    (gradient,) = torch.autograd.grad(shader.values("pol", outputs, axes).sum(), outputs)
+    x, y = torch.linalg.qr(torch.randn(5, 3, 2)).Q.unbind(-1)
+    angles = torch.tensor([0.0, 0.7, 2.0])
+    axes = torch.cos(angles)[None, :, None] * x[:, None] + torch.sin(angles)[None, :, None] * y[:, None]
+    j = coherency_from_factor(outputs[:, 3:9]) @ coherency_from_factor(outputs[:, 3:9]).mT
+    behind, stokes = shader.polarized("pol", outputs, x, y, angles)
+    torch.testing.assert_close(behind, 0.25 * torch.einsum("rki,rij,rkj->rk", axes, j, axes))
+    torch.testing.assert_close(stokes, 0.25 * coherency_to_stokes(j, x, y))
+    (gradient,) = torch.autograd.grad(behind.sum(), outputs)
     assert gradient[:, 3:9].all() and not gradient[:, :3].any() and not gradient[:, 9:].any()
 
 
