@@ -238,15 +238,15 @@ def steps(bed: Bed) -> list[Way]:
 
 
 def asked(bed: Bed) -> list[Way]:
-    """What is asked for: each modality alone and all of them, with the surface (depth and normals) and without, and the surface alone."""
+    """What is asked for: each modality alone and all of them, with normals and without, and the surface alone; depth comes with all."""
     s, names = bed.field.sampling, list(bed.field.sensors)
     sets = {name: [name] for name in names} | bed.sets
     light = [
-        Way("all rays", f"{name}{', depth, normals' if shape else ''}", chosen, s, shape)
+        Way("all rays", f"{name}{', normals' if shape else ''}", chosen, s, shape)
         for name, chosen in sets.items()
         for shape in (False, True)
     ]
-    return [*light, Way("all rays", "depth, normals", [], s, True)]
+    return [*light, Way("all rays", "depth", [], s), Way("all rays", "depth, normals", [], s, True)]
 
 
 def tiles(bed: Bed) -> list[Way]:

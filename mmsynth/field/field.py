@@ -40,7 +40,7 @@ class Rendering:
             intensities behind the sensor's analysers, in this camera's own frame.
         stokes: per polarization modality (H, W, 3): S0, S1, S2 in this camera's x-axis frame.
         depth_z, depth_ray: (H, W) float32 along the optical axis, along the ray; scene unit, NaN = no hit.
-        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit.
+        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit, or not asked for.
         opacity: (H, W) float32 in [0, 1], of the region of interest; 0 where the surface met lies outside it.
         valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
     """
@@ -181,7 +181,10 @@ class Field(nn.Module):
     def render_rays(
         self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
-        """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth, normal."""
+        """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth.
+
+        With ``geometry`` also normal: that takes four more samples a ray, depth comes with the light.
+        """
         jitter = torch.full((len(origins),), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
         return self.shown(hits, origins, directions, camera_x, modalities, geometry)
@@ -197,7 +200,8 @@ class Field(nn.Module):
         # a background is opaque, too, but what lies there is not the object
         reached = torch.linalg.vector_norm(origins + directions * hits.depth[:, None], dim=-1)
         within = torch.isnan(hits.depth) | (reached <= _WITHIN)
-        out = {"opacity": torch.where(within, hits.opacity, torch.zeros_like(hits.opacity)).clamp(0.0, 1.0)}
+        seen = torch.where(within, hits.opacity, torch.zeros_like(hits.opacity)).clamp(0.0, 1.0)
+        out = {"opacity": seen, "depth": hits.depth}
         for name in modalities:
             angles = self.sensors[name].polarizer_angles_deg
             if angles is None:
@@ -217,7 +221,7 @@ class Field(nn.Module):
             if self.surface.grid.extent > 1.0:
                 slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
-            out["depth"], out["normal"] = depth, normal
+            out["normal"] = normal
         return out
 
     def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
@@ -242,7 +246,8 @@ class Field(nn.Module):
 
         Args:
             camera: intrinsics and lens; rays go through the distorted lens.
-            camera_to_world: (4, 4), OpenCV axes, scene unit. modalities: names, all when None.
+            camera_to_world: (4, 4), OpenCV axes, scene unit. modalities: names, all when None. geometry: whether normals are wanted; depth
+                and opacity cost nothing.
             progress: called with the number of rays done since the last call.
         Raises:
             InputError: an unknown modality, or a pose that is not finite.

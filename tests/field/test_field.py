@@ -16,6 +16,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.radiance import Shader, intensity, radiance
 from mmsynth.scene.scene import Region, Sensor
+from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
 
 RGB = Sensor("rgb", ("R", "G", "B"), (None, None, None))
@@ -63,6 +64,26 @@ def test_normals_are_those_of_the_surface_that_is_seen(background: bool) -> None
     far = points.detach().norm(dim=1) > 1.0
     assert hit.sum() > 30 and (not background or (far.sum() > 150 and hit.sum() > 270))
     assert out["normal"][~hit].isnan().all()
+
+
+def test_only_what_is_asked_for_is_rendered() -> None:
+    field = _field(False)
+    camera = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
+    pose = np.eye(4)
+    pose[2, 3] = -1.5
+    whole = field.render(camera, pose)
+    for names, geometry in ((["nir"], False), ([], False), ([], True)):
+        seen = field.render(camera, pose, names, geometry)
+        assert list(seen.channels) == names and not seen.stokes
+        for name in names:
+            np.testing.assert_array_equal(seen.channels[name], whole.channels[name])
+        for part in ("depth_z", "depth_ray", "opacity"):
+            np.testing.assert_array_equal(getattr(seen, part), getattr(whole, part))
+        if geometry:
+            np.testing.assert_array_equal(seen.normal, whole.normal)
+        else:
+            assert np.isnan(seen.normal).all()
+    assert np.isfinite(whole.depth_ray).sum() > 20 and np.isfinite(whole.normal).sum() > 60
 
 
 def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
