@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from mmsynth.field import kernels
 from mmsynth.field.encoding import spherical_harmonics
 from mmsynth.scene.scene import Sensor
 from mmsynth.sensors.polarization import coherency_from_factor
@@ -40,6 +41,8 @@ class Shader(nn.Module):
         Args:
             degree: of the spherical harmonics of the direction that are seen, 0 = none; one number, or (R,) int64.
         """
+        if isinstance(degree, int) and kernels.on_cpu(features) and not torch.is_grad_enabled():
+            return kernels.cpu.shade(self, features, directions, degree)
         return self.heads(self.hidden(features, directions, degree))
 
     def hidden(self, features: Tensor, directions: Tensor, degree: Tensor | int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -126,6 +127,21 @@ def test_a_degree_hides_the_direction_beyond_it() -> None:
     degrees = torch.tensor([0, 1, 3]).repeat(10)
     expected = torch.stack([none, linear, all_of_them])[torch.tensor([0, 1, 2]).repeat(10), torch.arange(30)]
     torch.testing.assert_close(shader(features, directions, degrees), expected)
+
+
+@pytest.mark.parametrize("features,hidden,rays", [(4, 8, 1), (24, 64, 131), (20, 20, 64)])
+def test_shading_without_a_gradient_is_the_shader(features: int, hidden: int, rays: int) -> None:
+    torch.manual_seed(0)
+    shader = Shader(features, hidden, SENSORS, LEVELS)
+    x, directions = torch.randn(rays, features), normalize(torch.randn(rays, 3), dim=1)
+    for degree in range(4):
+        with torch.no_grad():
+            found = shader(x, directions, degree)
+        assert found.shape == (rays, 10) and not found.requires_grad and shader(x, directions, degree).requires_grad
+        truth = copy.deepcopy(shader).double()(x.double(), directions.double(), degree)
+        torch.testing.assert_close(found.double(), truth.detach(), atol=1e-6, rtol=1e-5)
+    with torch.no_grad():
+        assert shader(x[:0], directions[:0], 1).shape == (0, 10)
 
 
 def test_every_modality_has_the_view_dependence_that_it_needs() -> None:
