@@ -80,22 +80,22 @@ def _groups(methods: Sequence[Method]) -> list[list[Method]]:
 
 
 def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
-    """``cores``: CPU time per time, what of a shared machine the method got."""
+    """``cpu_ns``: as ``ns``, of CPU time: on a machine that others use, too, it says more than time."""
     times: list[list[float]] = [[] for _ in group]
-    worked = [0.0] * len(group)
+    work: list[list[float]] = [[] for _ in group]
     judged = [method.judge(method.run()) for method in group]
     for _ in range(repeats):
-        for i, method in enumerate(group):
-            began, work = time.perf_counter(), time.process_time()
+        for method, taken, worked in zip(group, times, work, strict=True):
+            began, busy = time.perf_counter(), time.process_time()
             method.run()
-            times[i].append(time.perf_counter() - began)
-            worked[i] += time.process_time() - work
+            taken.append(time.perf_counter() - began)
+            worked.append(time.process_time() - busy)
     return [
         {
             "family": method.family, "problem": method.problem, "method": method.name, "unit": method.unit,
-            "ns": statistics.median(taken) / method.count * 1e9, "cores": work / sum(taken), **found,
+            "ns": statistics.median(taken) / method.count * 1e9, "cpu_ns": statistics.median(worked) / method.count * 1e9, **found,
         }
-        for method, taken, work, found in zip(group, times, worked, judged, strict=True)
+        for method, taken, worked, found in zip(group, times, work, judged, strict=True)
     ]  # fmt: skip
 
 

@@ -328,7 +328,7 @@ def tables_of(results: Mapping[str, Any]) -> list[Table]:
         Column("rendered", "method"),
         Column("rays/s", "rays_per_s", ",.0f"),
         Column("ns", "ns", ",.0f"),
-        Column("cores", "cores", ".2f"),
+        Column("CPU ns", "cpu_ns", ",.0f"),
         Column("samples", "samples", ".1f"),
         Column("PSNR [dB]", "psnr", ".2f"),
         Column("error", "error", ".3%"),
@@ -339,7 +339,7 @@ def tables_of(results: Mapping[str, Any]) -> list[Table]:
     )
     fine, rows = results["reference"], results["rows"]
     note = (
-        f" {results['rays']:,} rays, the median of {results['repeats']} turns; cores: CPU time per time. Error and worst: of radiance, of "
+        f" {results['rays']:,} rays, the median of {results['repeats']} turns; CPU ns: of all threads. Error and worst: of radiance, of "
         f"full scale, against {fine['samples']:.0f} samples a ray, which is {fine['doubt']:.3%} from half as many. Depth: median, "
         "relative. Missed: rays of which one met the surface and one did not."
     )
