@@ -642,6 +642,24 @@ def bench_twin(
     _print_report(report, as_json)
 
 
+@command("render", of=bench_app)
+def bench_render(
+    run: RunOption = None,
+    only: Annotated[str | None, typer.Option(help="termination, steps, asked, tiles, threads; default: all")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="default: those of torch and numba")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="of each timing")] = 5,
+    out: Annotated[Path, typer.Option()] = Path("bench/render"),
+    as_json: JsonOption = False,
+) -> None:
+    """Rendering a fitted field: rays/s against error by early termination, sample budget, what is asked for, tiles and threads."""
+    from mmsynth.bench.render import bench_render as measure
+
+    _, field, scene = _load(run)
+    with _bar("bench render", as_json) as show:
+        report = measure(field, scene, out, None if only is None else [name.strip() for name in only.split(",")], threads, repeats, show)
+    _print_report(report, as_json)
+
+
 def _print_report(report: Any, as_json: bool) -> None:
     from mmsynth.bench.tables import print_tables
 

@@ -25,8 +25,9 @@ from mmsynth.field.surface import Surface
 from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
-from mmsynth.sensors.polarization import analyser_axes
+from mmsynth.sensors.polarization import reference_axes
 
+TILE = 8192  # rays at a time: what they need stays in the caches
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
 
@@ -39,7 +40,7 @@ class Rendering:
             intensities behind the sensor's analysers, in this camera's own frame.
         stokes: per polarization modality (H, W, 3): S0, S1, S2 in this camera's x-axis frame.
         depth_z, depth_ray: (H, W) float32 along the optical axis, along the ray; scene unit, NaN = no hit.
-        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit.
+        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit, or not asked for.
         opacity: (H, W) float32 in [0, 1], of the region of interest; 0 where the surface met lies outside it.
         valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
     """
@@ -180,28 +181,36 @@ class Field(nn.Module):
     def render_rays(
         self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
-        """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth, normal."""
-        rays = len(origins)
-        jitter = torch.full((rays,), 0.5, device=origins.device)
+        """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth.
+
+        With ``geometry`` also normal: that takes four more samples a ray, depth comes with the light.
+        """
+        jitter = torch.full((len(origins),), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
+        return self.shown(hits, origins, directions, camera_x, modalities, geometry)
+
+    @torch.no_grad()
+    def shown(
+        self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
+    ) -> dict[str, Tensor]:
+        """What rays show that met ``hits``: see ``render_rays``."""
         features, opacity = self.to_shade(hits)
         opacity = opacity[:, None]
         outputs = {d: self.shader(features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
         # a background is opaque, too, but what lies there is not the object
         reached = torch.linalg.vector_norm(origins + directions * hits.depth[:, None], dim=-1)
         within = torch.isnan(hits.depth) | (reached <= _WITHIN)
-        out = {"opacity": torch.where(within, hits.opacity, torch.zeros_like(hits.opacity)).clamp(0.0, 1.0)}
+        seen = torch.where(within, hits.opacity, torch.zeros_like(hits.opacity)).clamp(0.0, 1.0)
+        out = {"opacity": seen, "depth": hits.depth}
         for name in modalities:
             angles = self.sensors[name].polarizer_angles_deg
             if angles is None:
                 out[name] = opacity * self.shader.values(name, outputs[self.view_dependence[name]])
                 continue
-            degrees = torch.tensor((*angles, 0.0, 45.0, 90.0), device=origins.device)
-            axes = analyser_axes(directions, camera_x, torch.deg2rad(degrees).expand(rays, -1))
-            behind_analysers = opacity * self.shader.values(name, outputs[self.view_dependence[name]], axes)
-            out[name] = behind_analysers[:, :-3]
-            i0, i45, i90 = behind_analysers[:, -3:].unbind(1)
-            out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
+            x, y = reference_axes(directions, camera_x)
+            turned = torch.deg2rad(torch.tensor(angles, device=origins.device))
+            light = self.shader.polarized(name, outputs[self.view_dependence[name]], x, y, turned)
+            out[name], out[f"stokes/{name}"] = (opacity * part for part in light)
         if geometry:
             depth = hits.depth
             hit = torch.nonzero(torch.isfinite(depth))[:, 0]
@@ -212,15 +221,18 @@ class Field(nn.Module):
             if self.surface.grid.extent > 1.0:
                 slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
-            out["depth"], out["normal"] = depth, normal
+            out["normal"] = normal
         return out
 
     def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
         """``render_rays`` of rays of one camera: directions (R, 3) in its axes, scene frame; depth stays in radii."""
+        return {k: x.cpu().numpy() for k, x in self.render_rays(*self.placed(directions, camera_to_world), modalities, geometry).items()}
+
+    def placed(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""
         turned = torch.from_numpy((directions @ camera_to_world[:3, :3].T).astype(np.float32)).to(self.device)
         origin = self.to_normalised(camera_to_world[:3, 3]).expand(len(turned), 3)
-        camera_x = torch.from_numpy(camera_to_world[:3, 0].astype(np.float32)).to(self.device).expand(len(turned), 3)
-        return {key: value.cpu().numpy() for key, value in self.render_rays(origin, turned, camera_x, modalities, geometry).items()}
+        return origin, turned, torch.from_numpy(camera_to_world[:3, 0].astype(np.float32)).to(self.device).expand(len(turned), 3)
 
     def render(
         self,
@@ -234,7 +246,8 @@ class Field(nn.Module):
 
         Args:
             camera: intrinsics and lens; rays go through the distorted lens.
-            camera_to_world: (4, 4), OpenCV axes, scene unit. modalities: names, all when None.
+            camera_to_world: (4, 4), OpenCV axes, scene unit. modalities: names, all when None. geometry: whether normals are wanted; depth
+                and opacity cost nothing.
             progress: called with the number of rays done since the last call.
         Raises:
             InputError: an unknown modality, or a pose that is not finite.
@@ -248,8 +261,8 @@ class Field(nn.Module):
         rows = np.flatnonzero(valid)
         directions = in_camera.reshape(-1, 3)[rows]
         parts: dict[str, list[np.ndarray]] = {}
-        for start in range(0, len(directions), 8192):
-            part = directions[start : start + 8192]
+        for start in range(0, len(directions), TILE):
+            part = directions[start : start + TILE]
             for key, value in self.cast(part, pose, names, geometry).items():
                 parts.setdefault(key, []).append(value)
             if progress is not None:

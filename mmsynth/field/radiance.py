@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from mmsynth.field import kernels
 from mmsynth.field.encoding import spherical_harmonics
 from mmsynth.scene.scene import Sensor
 from mmsynth.sensors.polarization import coherency_from_factor
@@ -40,6 +41,8 @@ class Shader(nn.Module):
         Args:
             degree: of the spherical harmonics of the direction that are seen, 0 = none; one number, or (R,) int64.
         """
+        if isinstance(degree, int) and kernels.on_cpu(features) and not torch.is_grad_enabled():
+            return kernels.cpu.shade(self, features, directions, degree)
         return self.heads(self.hidden(features, directions, degree))
 
     def hidden(self, features: Tensor, directions: Tensor, degree: Tensor | int) -> Tensor:
@@ -47,18 +50,24 @@ class Shader(nn.Module):
         seen = self.term_degree <= (degree if isinstance(degree, int) else degree[:, None])
         return self.trunk(torch.cat([features, spherical_harmonics(directions) * seen], -1))
 
-    def values(self, modality: str, outputs: Tensor, axes: Tensor | None = None) -> Tensor:
-        """All channels of one modality, linear and ≥ 0.
+    def values(self, modality: str, outputs: Tensor) -> Tensor:
+        """All channels of one radiance modality, linear and ≥ 0: (R, outputs) → (R, C)."""
+        return radiance(outputs[:, self.columns[modality]]) * self.levels[modality]
+
+    def polarized(self, modality: str, outputs: Tensor, x: Tensor, y: Tensor, angles: Tensor) -> tuple[Tensor, Tensor]:
+        """All channels of one polarization modality, I = eᵀ J e behind analysers that all rays share, and the Stokes vectors.
 
         Args:
-            outputs: (R, outputs). axes: (R, K, 3) transmission axes of the analysers, for a polarization modality.
+            outputs: (R, outputs). x, y: (R, 3) reference axes of the rays. angles: (K,) from x towards y [rad].
         Returns:
-            (R, C) radiance, or (R, K) intensities I = eᵀ J e.
+            intensities (R, K) ≥ 0, and S0, S1, S2 in the frame of x and y: (R, 3).
         """
-        raw = outputs[:, self.columns[modality]]
-        if axes is None:
-            return radiance(raw) * self.levels[modality]
-        return intensity(raw[:, None], axes) * self.levels[modality]
+        # every axis is a sum of two, and so is Lᵀ e: two products with L serve all analysers
+        factor = coherency_from_factor(outputs[:, self.columns[modality]])
+        across, up = (torch.stack([x, y], 1) @ factor).unbind(1)
+        behind = (torch.cos(angles)[:, None, None] * across + torch.sin(angles)[:, None, None] * up).square().sum(-1).T
+        xx, yy, xy = across.square().sum(-1), up.square().sum(-1), (across * up).sum(-1)
+        return behind * self.levels[modality], torch.stack([xx + yy, xx - yy, 2.0 * xy], -1) * self.levels[modality]
 
 
 def radiance(raw: Tensor) -> Tensor:

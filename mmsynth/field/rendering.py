@@ -65,6 +65,15 @@ def ball_interval(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     return near, torch.maximum(middle + half, near)
 
 
+def interval(surface: Surface, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays begin and end: near, far (R,)."""
+    if surface.grid.extent > 1.0:
+        # a surface right before a camera explains its picture and no other: there is none
+        near = (_FREE * (torch.linalg.vector_norm(origins, dim=-1) - 1.0)).clamp(min=NEAR)
+        return near, torch.full_like(near, HORIZON)
+    return ball_interval(origins, directions)
+
+
 def trace(
     surface: Surface, appearance: HashGrid, occupancy: Occupancy, origins: Tensor, directions: Tensor, jitter: Tensor, sampling: Sampling
 ) -> Hits:
@@ -76,12 +85,7 @@ def trace(
         origins, directions: (R, 3), unit directions; gradients reach them with the samples' distances held fixed.
         jitter: (R,) in [0, 1), shifts the samples.
     """
-    if surface.grid.extent > 1.0:
-        # a surface right before a camera explains its picture and no other: there is none
-        near = (_FREE * (torch.linalg.vector_norm(origins.detach(), dim=-1) - 1.0)).clamp(min=NEAR)
-        far = torch.full_like(jitter, HORIZON)
-    else:
-        near, far = ball_interval(origins.detach(), directions.detach())
+    near, far = interval(surface, origins.detach(), directions.detach())
     if kernels.on_cpu(origins):
         return Hits(*kernels.cpu.trace(surface, appearance, occupancy.states, origins, directions, near, far, jitter, sampling))
     return trace_by_parts(surface, appearance, occupancy, origins, directions, near, far, jitter, sampling)
@@ -92,12 +96,20 @@ def trace_by_parts(
     jitter: Tensor, sampling: Sampling,
 ) -> Hits:  # fmt: skip
     """``trace`` from single operations, with autograd, on any device and in any precision; near, far: (R,)."""
-    rays = len(origins)
     with torch.no_grad():
-        t, ray, offsets = kernels.march(
+        samples = kernels.march(
             lambda x: surface(x, sampling.active_surface), origins, directions, near, far, jitter, occupancy.states,
             surface.grid.extent, sampling,
         )  # fmt: skip
+    return composite(surface, appearance, origins, directions, samples, sampling)
+
+
+def composite(
+    surface: Surface, appearance: HashGrid, origins: Tensor, directions: Tensor, samples: tuple[Tensor, Tensor, Tensor], sampling: Sampling
+) -> Hits:
+    """Evaluate, weigh and composite samples of R rays; samples: t, ray, offsets, see ``kernels.march``."""
+    rays = len(origins)
+    t, ray, offsets = samples
 
     def place(ray: Tensor, t: Tensor) -> Tensor:
         return surface.grid.place(origins[ray] + directions[ray] * t[:, None])
@@ -111,12 +123,12 @@ def trace_by_parts(
         ends = (before + weights > enough) & ~(before > enough)
         rest = torch.where(ends, 1.0 - before - weights, torch.zeros_like(weights))
     weights = weights + rest
-    opacity = torch.zeros_like(jitter).index_add(0, ray, weights)
+    opacity = weights.new_zeros(rays).index_add(0, ray, weights)
     chosen = torch.nonzero(weights.detach() > sampling.significant)[:, 0]
     following = (chosen + 1).clamp(max=max(len(t) - 1, 0))
     at, w = ray[chosen], weights[chosen]
     encoded = appearance(place(at, torch.lerp(t[chosen], t[following], crossing[chosen])), sampling.active_radiance)
-    shown = torch.zeros_like(jitter).index_add(0, at, w)
+    shown = w.new_zeros(rays).index_add(0, at, w)
     features = torch.zeros(rays, appearance.width, dtype=w.dtype, device=w.device).index_add(0, at, w[:, None] * encoded)
     depth = median_depth(t, weights.detach(), before, crossing, ray, rays)
     return Hits(features / shown.clamp(min=1e-12)[:, None], opacity, depth, torch.tensor(len(t)))

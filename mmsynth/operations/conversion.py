@@ -169,8 +169,7 @@ def convert_frame(
     expected = (camera.height, camera.width) + (() if sensor.mosaic is not None else (sensor.channel_count,))
     if raw.shape != expected:
         raise InputError(f"convert: a frame of shape {raw.shape}, expected {expected} of {source}.")
-    elsewhere = seen_by is not None
-    seen = field.render(camera, pose, list(dict.fromkeys((source, target))), geometry=elsewhere, progress=progress)
+    seen = field.render(camera, pose, list(dict.fromkeys((source, target))), geometry=False, progress=progress)
     hint = guide(raw, seen.channels[source], sensor, seen.valid)
     of_light = field.sensors[target].is_polarization  # one gain for all of a Stokes vector
     gain = np.ones((*seen.valid.shape, 1 if of_light else field.sensors[target].channel_count))
@@ -183,7 +182,7 @@ def convert_frame(
     if seen_by is None:
         maps = gain, more, hint.gain_sd
         return _put_together(field, target, used, seen, maps, seen.valid & ~hint.strange, hint.strange, hint)
-    there = field.render(*seen_by, [target], geometry=True, progress=progress)
+    there = field.render(*seen_by, [target], geometry=False, progress=progress)
     gain, more = gain**_CARRIED, more * _CARRIED
     layers = np.dstack([gain, more, hint.gain_sd, seen.valid, hint.strange])
     carried, visible = _carried(layers, seen, (camera, pose), there, seen_by)
@@ -249,8 +248,7 @@ def carried_through(
     field: Field, values: np.ndarray, frame: tuple[Camera, np.ndarray], seen_by: tuple[Camera, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values (H, W, M) of one camera's pixels → on another's, through the field's surface; and where it sees the same surface."""
-    some = next(iter(field.sensors))
-    seen, there = field.render(*frame, [some]), field.render(*seen_by, [some])
+    seen, there = (field.render(*by, [], geometry=False) for by in (frame, seen_by))
     return _carried(np.where(seen.valid[..., None], values, 0.0), seen, frame, there, seen_by)
 
 

@@ -86,7 +86,7 @@ def landmarks(field: Field, scene: Scene, source: str, progress: Progress | None
         points, descriptors = _features(_grey(load_frame(sensor, frame)[0], sensor))
         pose = frame.camera_to_world
         rays, valid = unproject(points, frame.camera)
-        depth = field.cast(rays, pose, [source], True)["depth"].astype(np.float64) * field.region.radius if len(rays) else np.zeros(0)
+        depth = field.cast(rays, pose, [], False)["depth"].astype(np.float64) * field.region.radius if len(rays) else np.zeros(0)
         valid &= np.isfinite(depth)
         out.append(Features((pose[:3, 3] + rays @ pose[:3, :3].T * depth[:, None])[valid], descriptors[valid]))
         if progress is not None:

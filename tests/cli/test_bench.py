@@ -109,3 +109,16 @@ def test_bench_twin(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "here").iterdir()} == {"results.json", "report.md", "plot.svg"}
     refused(call("bench", "twin", "--only", "magic"), "'magic'", "effects")
     refused(call("bench", "twin", "--run", "nowhere"), "nowhere", "no finished fit")
+
+
+def test_bench_render(tmp_path: Path) -> None:
+    assert call("fit", "example", "--steps", "3", "--modalities", "rgb,pol", "--json").exit_code == 0
+    result = call("bench", "render", "--only", "asked", "--threads", "1", "--repeats", "1", "--json")
+    assert result.exit_code == 0, result.output
+    results = json.loads(result.stdout)
+    assert results["out"] == "bench/render" and results["machine"]["threads"] == 1 and results["repeats"] == 1
+    assert {row["method"].split(",")[0] for row in results["rows"]} == {"rgb", "pol", "all 2", "depth"}
+    assert {path.name for path in (tmp_path / "bench" / "render").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    refused(call("bench", "render", "--only", "magic"), "'magic'", "termination")
+    refused(call("bench", "render", "--run", "nowhere"), "nowhere", "no finished fit")
+    refused(call("bench", "render", "--threads", "99999"), "--threads")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.radiance import Shader, intensity, radiance
 from mmsynth.scene.scene import Region, Sensor
-from mmsynth.sensors.polarization import coherency_from_factor
+from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
 
 RGB = Sensor("rgb", ("R", "G", "B"), (None, None, None))
 POL = Sensor("pol", ("0", "45", "90", "135"), (None,) * 4, None, (0.0, 45.0, 90.0, 135.0))
@@ -65,6 +67,26 @@ def test_normals_are_those_of_the_surface_that_is_seen(background: bool) -> None
     assert out["normal"][~hit].isnan().all()
 
 
+def test_only_what_is_asked_for_is_rendered() -> None:
+    field = _field(False)
+    camera = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
+    pose = np.eye(4)
+    pose[2, 3] = -1.5
+    whole = field.render(camera, pose)
+    for names, geometry in ((["nir"], False), ([], False), ([], True)):
+        seen = field.render(camera, pose, names, geometry)
+        assert list(seen.channels) == names and not seen.stokes
+        for name in names:
+            np.testing.assert_array_equal(seen.channels[name], whole.channels[name])
+        for part in ("depth_z", "depth_ray", "opacity"):
+            np.testing.assert_array_equal(getattr(seen, part), getattr(whole, part))
+        if geometry:
+            np.testing.assert_array_equal(seen.normal, whole.normal)
+        else:
+            assert np.isnan(seen.normal).all()
+    assert np.isfinite(whole.depth_ray).sum() > 20 and np.isfinite(whole.normal).sum() > 60
+
+
 def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
     field = _field(True, Region((10.0, 0.0, -5.0), 3.0))
     x = np.array([[10.0, 0.0, -5.0], [10.0, 1.8, -5.0], [10.0, 0.0, 25.0], [-300.0, 200.0, 0.0]])
@@ -107,6 +129,21 @@ def test_a_degree_hides_the_direction_beyond_it() -> None:
     torch.testing.assert_close(shader(features, directions, degrees), expected)
 
 
+@pytest.mark.parametrize("features,hidden,rays", [(4, 8, 1), (24, 64, 131), (20, 20, 64)])
+def test_shading_without_a_gradient_is_the_shader(features: int, hidden: int, rays: int) -> None:
+    torch.manual_seed(0)
+    shader = Shader(features, hidden, SENSORS, LEVELS)
+    x, directions = torch.randn(rays, features), normalize(torch.randn(rays, 3), dim=1)
+    for degree in range(4):
+        with torch.no_grad():
+            found = shader(x, directions, degree)
+        assert found.shape == (rays, 10) and not found.requires_grad and shader(x, directions, degree).requires_grad
+        truth = copy.deepcopy(shader).double()(x.double(), directions.double(), degree)
+        torch.testing.assert_close(found.double(), truth.detach(), atol=1e-6, rtol=1e-5)
+    with torch.no_grad():
+        assert shader(x[:0], directions[:0], 1).shape == (0, 10)
+
+
 def test_every_modality_has_the_view_dependence_that_it_needs() -> None:
     field = _field(False)
     field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
@@ -139,11 +176,14 @@ def test_modalities_have_their_own_outputs() -> None:
     outputs = torch.randn(5, 10, requires_grad=True)
     torch.testing.assert_close(shader.values("rgb", outputs), 0.5 * softplus(outputs[:, :3]))
     torch.testing.assert_close(shader.values("nir", outputs), 2.0 * softplus(outputs[:, 9:]))
-    axes = normalize(torch.randn(5, 2, 3), dim=-1)
-    j = coherency_from_factor(outputs[:, 3:9])
-    expected = 0.25 * torch.einsum("rki,rij,rkj->rk", axes, j @ j.mT, axes)
-    torch.testing.assert_close(shader.values("pol", outputs, axes), expected)
-    (gradient,) = torch.autograd.grad(shader.values("pol", outputs, axes).sum(), outputs)
+    x, y = torch.linalg.qr(torch.randn(5, 3, 2)).Q.unbind(-1)
+    angles = torch.tensor([0.0, 0.7, 2.0])
+    axes = torch.cos(angles)[None, :, None] * x[:, None] + torch.sin(angles)[None, :, None] * y[:, None]
+    j = coherency_from_factor(outputs[:, 3:9]) @ coherency_from_factor(outputs[:, 3:9]).mT
+    behind, stokes = shader.polarized("pol", outputs, x, y, angles)
+    torch.testing.assert_close(behind, 0.25 * torch.einsum("rki,rij,rkj->rk", axes, j, axes))
+    torch.testing.assert_close(stokes, 0.25 * coherency_to_stokes(j, x, y))
+    (gradient,) = torch.autograd.grad(behind.sum(), outputs)
     assert gradient[:, 3:9].all() and not gradient[:, :3].any() and not gradient[:, 9:].any()
 
 

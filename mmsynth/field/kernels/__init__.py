@@ -120,6 +120,7 @@ def announce_compilation() -> None:
         rays, numbers = (directions, index, index == 0), (one, index, index, torch.empty(0, 3), one, one, one)
         loss, _ = cpu.compare(shader, hits.features, hits.opacity, rays, numbers, None)
         (loss + surface(origins, 1).sum()).backward()
+        cpu.shade(shader, hits.features, directions, 0)
     for count in (1, cpu.PART + 1):
         parameter, gradient, first, second = torch.zeros(4, count)
         adam(parameter, gradient, first, second, 1e-3, 0.9, 0.99, 1e-15, 1)

@@ -261,6 +261,14 @@ def compare(
     return _Compare.apply(_kept(features, opacity, gain, *weights), rays, numbers, features, opacity, gain, *weights)
 
 
+def shade(shader: Shader, features: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """See ``Shader.forward``; float32, without a gradient."""
+    weights = tuple(shader.parameters())
+    outputs = torch.empty(len(features), len(weights[5]))
+    cpu_shading.shade(_array(features), _array(directions), degree, *map(_array, weights), outputs.numpy())
+    return outputs
+
+
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def _adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -295,7 +303,7 @@ def adam(
 
 _KERNELS = (
     cpu_rays.surface_forward, cpu_rays.surface_backward, cpu_rays.surface_scatter, cpu_rays.trace_forward, cpu_rays.trace_backward,
-    cpu_rays.trace_scatter, cpu_shading.compare, _adam, _adam_part,
+    cpu_rays.trace_scatter, cpu_shading.compare, cpu_shading.shade, _adam, _adam_part,
 )  # fmt: skip
 
 

@@ -315,3 +315,40 @@ def compare(  # type: ignore[no-untyped-def]
             x_of[slot], h1_of[slot], h2_of[slot], g1_of[slot], g2_of[slot], squared, g_features, g_opacity, g_gain,
             first_out[chunk], first_bias_out[chunk], second_out[chunk], second_bias_out[chunk], heads_out[chunk], heads_bias_out[chunk],
         )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shade_chunk(  # type: ignore[no-untyped-def]
+    begin, n, features, directions, degree, first, first_bias, second, second_bias, heads, heads_bias, outputs
+):  # fmt: skip
+    """Outputs of n rays. Matrices have a column per unit, and whole tiles."""
+    width, rows = features.shape[1], _whole(n, TALL)
+    x = np.zeros((rows, first.shape[0]), np.float32)
+    h1, h2 = np.empty((rows, first.shape[1]), np.float32), np.empty((rows, second.shape[1]), np.float32)
+    out = np.zeros((rows, heads.shape[1]), np.float32)
+    for i in range(n):
+        o = begin + i
+        for j in range(width):
+            x[i, j] = features[o, j]
+        _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degree, x[i, width:])
+    _layer(n, x, _whole(width + (TERMS if degree else 1), WIDE), first, first_bias, h1)
+    _layer(n, h1, h1.shape[1], second, second_bias, h2)
+    _add_product(h2, heads, out, rows, h2.shape[1], out.shape[1])
+    for i in range(n):
+        for k in range(len(heads_bias)):
+            outputs[begin + i, k] = out[i, k] + heads_bias[k]
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def shade(  # type: ignore[no-untyped-def]
+    features, directions, degree, first, first_bias, second, second_bias, heads, heads_bias, outputs
+):  # fmt: skip
+    """See ``radiance.Shader.forward``, of rays that all have one degree."""
+    rays = len(features)
+    first_turned, second_turned, heads_turned = _padded(first.T), _padded(second.T), _padded(heads.T)
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        begin = np.int64(task) * CHUNK
+        _shade_chunk(
+            begin, min(CHUNK, rays - begin), features, directions, degree,
+            first_turned, first_bias, second_turned, second_bias, heads_turned, heads_bias, outputs,
+        )  # fmt: skip

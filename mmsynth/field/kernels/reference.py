@@ -114,12 +114,13 @@ def march(
     states: Tensor,
     extent: float,
     sampling: Sampling,
+    most: int = MOST,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Sample rays where the three-state grid says that a surface may be, guided by the distance at the samples.
 
     Outside cells are skipped, by the distance that they certify. From a sample with distance f, a ray goes on by
     step / slope, the slope being how fast f fell since the last sample, or by ``stride`` (f - 3 / s) where that is longer. It
-    ends in a solid cell (at its second sample at the earliest), at an optical depth of ``opaque``, and after ``MOST`` samples.
+    ends in a solid cell (at its second sample at the earliest), at an optical depth of ``opaque``, and after ``most`` samples.
 
     Args:
         sdf: (N, 3) → (N,). origins, directions: (R, 3). near, far, jitter: (R,).
@@ -134,7 +135,7 @@ def march(
     last = torch.zeros_like(t), torch.zeros_like(t)  # the last sample: where, distance
     depth = torch.zeros_like(t)
     found: list[tuple[Tensor, Tensor]] = []
-    for k in range(MOST):
+    for k in range(most):
         here = going
         at, where, reach, speed, state = _advance(origins[here], directions[here], t[here], far[here], jitter[here], states, extent, s.step)
         alive = at < far[here]

@@ -1,0 +1,366 @@
+"""``mmsynth bench render``: rays per second of a fitted field against error, by what a ray is sampled with and what is asked of it.
+
+The error is that of sampling alone: each way to render is judged by a fine rendering of the same field, which single operations of
+torch make from rays that are never cut off, not by the kernel that is timed. Ways take turns, see ``methods``. To add a way, add a
+``Way`` to its family.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from mmsynth.bench.machine import measure, use_threads
+from mmsynth.bench.methods import Method, family_tables, measured_methods
+from mmsynth.bench.output import Report, new_figure, write_report
+from mmsynth.bench.tables import Column, Table
+from mmsynth.errors import InputError
+from mmsynth.field import rendering
+from mmsynth.field.field import TILE, Field
+from mmsynth.field.kernels import reference
+from mmsynth.field.rendering import Sampling
+from mmsynth.operations.progress import Progress
+from mmsynth.scene.scene import Scene
+from mmsynth.sensors.camera import ray_map
+
+REPEATS = 5
+VIEWS, RAYS = 4, 65536
+FINE_STEP, FINE_STRIDE, FINE_OPAQUE = 0.25, 0.35, 12.0  # of the reference; all its sections have their own appearance
+_FINE_MOST = 4096  # samples of one of its rays
+_FINE_RAYS = 4096  # of it at a time
+Outputs = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays of some views, R in all, in the field's normalised frame: origins, directions, camera_x (R, 3)."""
+
+    origins: Tensor
+    directions: Tensor
+    camera_x: Tensor
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def tile(self, start: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+        return self.origins[start : start + size], self.directions[start : start + size], self.camera_x[start : start + size]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The reference: outputs, of all modalities and with geometry; samples: taken per ray; doubt: how far a reference of twice the
+    step is from it, root mean square in parts of full scale."""
+
+    outputs: Outputs
+    samples: float
+    doubt: float
+
+
+@dataclass(frozen=True)
+class Bed:
+    """What all families render: a field's rays, and what is right for them."""
+
+    field: Field
+    rays: Rays
+    truth: Truth
+
+    @property
+    def sets(self) -> dict[str, list[str]]:
+        """Modalities that are rendered together: one, and all."""
+        names = list(self.field.sensors)
+        return {names[0]: names[:1]} | ({f"all {len(names)}": names} if len(names) > 1 else {})
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to render: with a sampling, by tiles of so many rays, on ``threads`` (None: those of the bench)."""
+
+    problem: str
+    name: str
+    modalities: Sequence[str]
+    sampling: Sampling
+    geometry: bool = False
+    tile: int = TILE
+    threads: int | None = None
+
+
+# --- rays and their truth
+
+
+def rays_of(field: Field, scene: Scene) -> Rays:
+    """At most ``RAYS`` rays of ``VIEWS`` training views of the field's reference camera: whole rows, evenly spread.
+
+    Raises:
+        InputError: the scene has no frame of it.
+    """
+    name = next(iter(field.sensors))
+    frames = scene.frames_of(name, scene.split.train) or scene.frames_of(name)
+    if not frames:
+        raise InputError(f"bench render: the scene has no frame of {name}, the reference camera of the field.")
+    chosen = [frames[i] for i in sorted({round(i) for i in np.linspace(0, len(frames) - 1, VIEWS)})]
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
+    for frame in chosen:
+        directions, valid = ray_map(frame.camera)
+        height, width = valid.shape
+        rows = np.unique(np.linspace(0, height - 1, min(height, max(1, RAYS // len(chosen) // width))).round().astype(int))
+        parts.append(field.placed(directions[rows][valid[rows]], field.pose_of(frame)))
+    return Rays(*(torch.cat(x) for x in zip(*parts, strict=True)))
+
+
+def fine(sampling: Sampling, coarser: float = 1.0) -> Sampling:
+    """The sampling of the reference, or one of a longer step."""
+    return dataclasses.replace(
+        sampling, opaque=FINE_OPAQUE, step=sampling.step * FINE_STEP * coarser, stride=FINE_STRIDE * coarser, significant=0.0
+    )
+
+
+@torch.no_grad()
+def truth_of(field: Field, rays: Rays) -> Truth:
+    """Render the reference, and one of twice the step to tell how sure it is."""
+    outputs, samples = _exact(field, rays, fine(field.sampling))
+    coarse, _ = _exact(field, rays, fine(field.sampling, 2.0))
+    return Truth(outputs, samples, difference(coarse, outputs, list(field.sensors))["error"])
+
+
+def _exact(field: Field, rays: Rays, sampling: Sampling) -> tuple[Outputs, float]:
+    """By single operations, and not as many samples a ray as the kernel has room for but as many as it takes."""
+    surface, parts, samples = field.surface, [], 0
+    for start in range(0, len(rays), _FINE_RAYS):
+        origins, directions, camera_x = rays.tile(start, _FINE_RAYS)
+        near, far = rendering.interval(surface, origins, directions)
+        taken = reference.march(
+            lambda x: surface(x, sampling.active_surface), origins, directions, near, far, torch.full_like(near, 0.5),
+            field.occupancy.states, surface.grid.extent, sampling, _FINE_MOST,
+        )  # fmt: skip
+        hits = rendering.composite(surface, field.appearance, origins, directions, taken, sampling)
+        samples += int(hits.samples)
+        parts.append(field.shown(hits, origins, directions, camera_x, list(field.sensors), True))
+    return _joined(parts), samples / len(rays)
+
+
+def _joined(parts: Sequence[Outputs]) -> Outputs:
+    return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+
+
+def _with(field: Field, sampling: Sampling) -> Field:
+    """The same field, sampled otherwise; its tensors are shared."""
+    other = copy.copy(field)
+    other.sampling = sampling
+    return other
+
+
+# --- rendering and judging
+
+
+def render(bed: Bed, way: Way) -> Outputs:
+    """All rays, the way an operation has them rendered."""
+    field = _with(bed.field, way.sampling)
+    with use_threads(way.threads):
+        starts = range(0, len(bed.rays), way.tile)
+        return _joined([field.render_rays(*bed.rays.tile(start, way.tile), way.modalities, way.geometry) for start in starts])
+
+
+def difference(found: Outputs, truth: Outputs, modalities: Sequence[str]) -> dict[str, float]:
+    """Of radiance, in parts of full scale: ``error`` (root mean square), ``worst``, ``psnr`` [dB, peak 1]."""
+    apart = torch.cat([(found[name] - truth[name]).flatten() for name in modalities]).double().abs()
+    error = float(apart.square().mean().sqrt())
+    return {"error": error, "worst": float(apart.max()), "psnr": -20.0 * math.log10(max(error, 1e-12))}
+
+
+def shape_difference(found: Outputs, truth: Outputs) -> dict[str, float]:
+    """Of the surface: ``depth`` (median, relative), ``normal`` (median, °), ``missed``: share of rays of which one met it, one did not."""
+    met = torch.isfinite(found["depth"]), torch.isfinite(truth["depth"])
+    both = met[0] & met[1]
+    out = {"missed": float((met[0] != met[1]).double().mean())}
+    if not both.any():
+        return out
+    depth, true = found["depth"][both].double(), truth["depth"][both].double()
+    a, b = found["normal"][both].double(), truth["normal"][both].double()
+    turned = torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=1), (a * b).sum(1))
+    return out | {"depth": float(((depth - true).abs() / true).median()), "normal": float(torch.rad2deg(turned).median())}
+
+
+def judge(bed: Bed, way: Way, found: Outputs) -> dict[str, float]:
+    """Radiance of what was rendered; depth, normals and samples per ray of its rays, whether they were asked for or not."""
+    whole = render(bed, dataclasses.replace(way, modalities=[], geometry=True))
+    radiance = difference(found, bed.truth.outputs, way.modalities) if way.modalities else {}
+    return radiance | shape_difference(whole, bed.truth.outputs) | {"samples": _samples(bed, way)}
+
+
+@torch.no_grad()
+def _samples(bed: Bed, way: Way) -> float:
+    field, total = bed.field, 0
+    for start in range(0, len(bed.rays), TILE):
+        origins, directions, _ = bed.rays.tile(start, TILE)
+        middle = torch.full((len(origins),), 0.5)
+        total += int(rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, way.sampling).samples)
+    return total / len(bed.rays)
+
+
+# --- families
+
+
+def termination(bed: Bed) -> list[Way]:
+    """The optical depth at which a ray ends."""
+    s = bed.field.sampling
+    values = sorted({1.0, 2.0, 3.0, 5.0, 8.0, s.opaque})
+    return [
+        Way(problem, f"opaque {v:g}{_own(v == s.opaque)}", names, dataclasses.replace(s, opaque=v))
+        for problem, names in bed.sets.items()
+        for v in values
+    ]
+
+
+def steps(bed: Bed) -> list[Way]:
+    """How a ray is sampled: the step at the surface, the stride towards it, and how much a section weighs that has its own appearance."""
+    s = bed.field.sampling
+    variants: list[tuple[str, dict[str, float]]] = [(f"step x {v:g}{_own(v == 1.0)}", {"step": v * s.step}) for v in (0.5, 1.0, 2.0, 4.0)]
+    for name, values in (("stride", (0.4, 0.7, 0.9)), ("significant", (0.0, 1e-2, 5e-2))):
+        own = getattr(s, name)
+        variants += [(f"{name} {v:g}{_own(v == own)}", {name: v}) for v in sorted({*values, own})]
+    return [
+        Way(problem, name, names, dataclasses.replace(s, **change))  # type: ignore[arg-type]
+        for problem, names in bed.sets.items()
+        for name, change in variants
+    ]
+
+
+def asked(bed: Bed) -> list[Way]:
+    """What is asked for: each modality alone and all of them, with normals and without, and the surface alone; depth comes with all."""
+    s, names = bed.field.sampling, list(bed.field.sensors)
+    sets = {name: [name] for name in names} | bed.sets
+    light = [
+        Way("all rays", f"{name}{', normals' if shape else ''}", chosen, s, shape)
+        for name, chosen in sets.items()
+        for shape in (False, True)
+    ]
+    return [*light, Way("all rays", "depth", [], s), Way("all rays", "depth, normals", [], s, True)]
+
+
+def tiles(bed: Bed) -> list[Way]:
+    """Rays per tile."""
+    return [
+        Way(problem, f"{size} rays{_own(size == TILE)}", names, bed.field.sampling, tile=size)
+        for problem, names in bed.sets.items()
+        for size in (1024, 4096, 8192, 16384, 65536)
+    ]
+
+
+def threads(bed: Bed) -> list[Way]:
+    """Threads, from one to as many as numba was started with, by doubling."""
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    counts = sorted({*(2**i for i in range(most.bit_length()) if 2**i <= most), most})
+    return [Way(p, f"{n} threads", names, bed.field.sampling, threads=n) for p, names in bed.sets.items() for n in counts]
+
+
+def _own(yes: bool) -> str:
+    return " (the field's)" if yes else ""
+
+
+FAMILIES = (termination, steps, asked, tiles, threads)
+
+
+# --- the bench
+
+
+def bench_render(
+    field: Field,
+    scene: Scene,
+    out: Path,
+    only: Sequence[str] | None = None,
+    threads: int | None = None,
+    repeats: int = REPEATS,
+    progress: Progress | None = None,
+) -> Report:
+    """Run all families, or those named in ``only``.
+
+    Args:
+        scene: whose views are rendered. threads: of torch and numba; None: as they are. repeats: of each timing.
+    Raises:
+        InputError: an unknown name, a scene without frames, more threads than numba was started with, or ``out`` cannot be written.
+    """
+    known = {family.__name__: family for family in FAMILIES}
+    for name in only or ():
+        if name not in known:
+            raise InputError(f"bench render: no family {name!r}, expected some of {', '.join(known)}.")
+    with use_threads(threads):
+        machine = measure()
+        rays = rays_of(field, scene)
+        bed = Bed(field, rays, truth_of(field, rays))
+        chosen = {name: family(bed) for name, family in known.items() if only is None or name in only}
+        methods = [_method(bed, name, way) for name, ways in chosen.items() for way in ways]
+        rows = measured_methods(methods, repeats, progress, torch.get_num_threads())
+    for row in rows:
+        row["rays_per_s"] = 1e9 / row["ns"]
+    results = {
+        "bench": "render",
+        "machine": machine,
+        "rows": rows,
+        "repeats": repeats,
+        "rays": len(rays),
+        "sampling": dataclasses.asdict(field.sampling),
+        "reference": dataclasses.asdict(fine(field.sampling)) | {"samples": bed.truth.samples, "doubt": bed.truth.doubt},
+    }
+    return write_report(results, tables_of(results), plot(results), out)
+
+
+def _method(bed: Bed, family: str, way: Way) -> Method:
+    run, judged = functools.partial(render, bed, way), functools.partial(judge, bed, way)
+    return Method(family, way.problem, way.name, run, judged, len(bed.rays), "full scale")
+
+
+def tables_of(results: Mapping[str, Any]) -> list[Table]:
+    """A table per family."""
+    columns = (
+        Column("of", "problem"),
+        Column("rendered", "method"),
+        Column("rays/s", "rays_per_s", ",.0f"),
+        Column("ns", "ns", ",.0f"),
+        Column("CPU ns", "cpu_ns", ",.0f"),
+        Column("samples", "samples", ".1f"),
+        Column("PSNR [dB]", "psnr", ".2f"),
+        Column("error", "error", ".3%"),
+        Column("worst", "worst", ".1%"),
+        Column("depth", "depth", ".1e"),
+        Column("missed", "missed", ".3%"),
+        Column("normals [°]", "normal", ".2f"),
+    )
+    fine, rows = results["reference"], results["rows"]
+    note = (
+        f" {results['rays']:,} rays, the median of {results['repeats']} turns; CPU ns: of all threads. Error and worst: of radiance, of "
+        f"full scale, against {fine['samples']:.0f} samples a ray, which is {fine['doubt']:.3%} from half as many. Depth: median, "
+        "relative. Missed: rays of which one met the surface and one did not."
+    )
+    return family_tables(rows, columns, FAMILIES, {family.__name__: note for family in FAMILIES})
+
+
+def plot(results: Mapping[str, Any]) -> Figure:
+    """Error over rays per second, both log, a panel per family."""
+    rows = [row for row in results["rows"] if "error" in row]
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    figure, axes = new_figure(len(families))
+    for one, family in zip(axes, families, strict=True):
+        here = [row for row in rows if row["family"] == family]
+        markers = dict(zip(dict.fromkeys(row["problem"] for row in here), "os^v", strict=False))
+        colours = {name: f"C{i % 10}" for i, name in enumerate(dict.fromkeys(row["method"] for row in here))}
+        for row in here:
+            label = f"{row['problem']}: {row['method']}"
+            one.scatter(
+                row["rays_per_s"], max(row["error"], 1e-9), s=24, color=colours[row["method"]], marker=markers[row["problem"]], label=label
+            )
+        one.axhline(max(results["reference"]["doubt"], 1e-9), color="0.5", linewidth=0.8, linestyle="--")
+        one.set(xscale="log", yscale="log", xlabel="rays per second", ylabel="error [full scale]", title=family)
+        one.legend(frameon=False, fontsize=6)
+    return figure
