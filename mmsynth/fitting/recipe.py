@@ -57,6 +57,7 @@ class Recipe(BaseModel):
     sharpness_end: float = Field(4.0, gt=0, description="at the end, in units of 1 / pixel footprint")
     sharpness_until: float = Field(0.6, gt=0, le=1, description="progress at which the sharpness reaches its end")
     step_width: float = Field(2.0, gt=0, description="step between samples at the surface, in units of 1 / sharpness")
+    rendered_step: float = Field(0.5, gt=0, le=1, description="step of the finished field's renderings, in units of the fit's last")
     stride: float = Field(0.7, gt=0, le=1, description="share of the free distance that a ray goes at once")
     grazing: float = Field(0.5, gt=0, le=1, description="least slope towards the surface by which a ray's steps are lengthened")
     significant: float = Field(1e-2, ge=0, lt=1, description="weight of a section below which it has no appearance of its own")

@@ -11,7 +11,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -476,7 +476,8 @@ def fit(
 def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
     field, news = trainer.field, trainer.report()
     trainer.average.apply()
-    field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
+    last = sampling_at(1.0, trainer.recipe, trainer.needs)
+    field.sampling = replace(last, step=last.step * trainer.recipe.rendered_step)
     field.occupancy.update(
         lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
     )
