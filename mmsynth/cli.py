@@ -434,7 +434,7 @@ def mesh(
     keep: Annotated[str, typer.Option(help="components: clean (no specks), all, largest, or how many")] = "clean",
     min_views: Annotated[int, typer.Option(min=0, help="keep components only that so many training views see")] = 0,
     faces: Annotated[int | None, typer.Option(min=4, help="decimate to so many")] = None,
-    max_error: Annotated[float | None, typer.Option(help="or as far as no face leaves the surface by more [unit]")] = None,
+    max_error: Annotated[float | None, typer.Option(help="or as far as 99.9 % of it stays that near [unit]")] = None,
     geometry_only: Annotated[bool, typer.Option("--geometry-only", help="no colours and no modalities on the vertices")] = False,
     against: Annotated[Path | None, typer.Option(help="score it against this mesh, in the same frame and unit")] = None,
     distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002; default: 0.5, 1 and 2 % of the radius")] = None,

@@ -25,7 +25,7 @@ from mmsynth.field.surface import Surface
 from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
-from mmsynth.sensors.polarization import analyser_axes
+from mmsynth.sensors.polarization import analyser_axes, stokes_to_intensities
 
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
@@ -196,12 +196,12 @@ class Field(nn.Module):
             if angles is None:
                 out[name] = opacity * self.shader.values(name, outputs[self.view_dependence[name]])
                 continue
-            degrees = torch.tensor((*angles, 0.0, 45.0, 90.0), device=origins.device)
+            # three intensities have all that linear polarization is; the sensor's analysers follow from it
+            degrees = torch.tensor((0.0, 45.0, 90.0), device=origins.device)
             axes = analyser_axes(directions, camera_x, torch.deg2rad(degrees).expand(rays, -1))
-            behind_analysers = opacity * self.shader.values(name, outputs[self.view_dependence[name]], axes)
-            out[name] = behind_analysers[:, :-3]
-            i0, i45, i90 = behind_analysers[:, -3:].unbind(1)
+            i0, i45, i90 = (opacity * self.shader.values(name, outputs[self.view_dependence[name]], axes)).unbind(1)
             out[f"stokes/{name}"] = torch.stack([i0 + i90, i0 - i90, 2 * i45 - i0 - i90], -1)
+            out[name] = stokes_to_intensities(out[f"stokes/{name}"], angles)
         if geometry:
             depth = hits.depth
             hit = torch.nonzero(torch.isfinite(depth))[:, 0]

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -185,7 +185,8 @@ def add_attributes(mesh: trimesh.Trimesh, field: Field, scene: Scene, cell: floa
     values = {key: np.concatenate([part[key] for part in found]).astype(np.float32) for key in found[0]}
     mesh.vertex_attributes.update(values)
     mesh.metadata["properties"] = _described(sensors)
-    mesh.visual.vertex_colors = _preview(sensors, values)
+    visual: Any = mesh.visual
+    visual.vertex_colors = _preview(sensors, values)
 
 
 def _of_part(
@@ -249,8 +250,8 @@ def _described(sensors: Sequence[Sensor]) -> dict[str, str]:
             out[f"{sensor.name}_{i}"] = f"channel {label}{at}, linear, 1 = full scale"
     return out | {
         "views": "training views that see the vertex",
-        "spread": "deviation of the light between views over its mean",
-        "confidence": "0 to 1, from views, spread and residual",
+        "spread": "deviation of the light between rays over its mean",
+        "confidence": "confidence, 0 to 1, from views, spread and residual",
     }
 
 

@@ -1,9 +1,10 @@
 """Meshes as files, in the mesh's own frame and unit, which is nowhere changed.
 
-* PLY (binary, little endian): per vertex position, normal, preview colour (red, green, blue: uint8), then every attribute as a float property
-  of its own name; NaN = not seen. The header's comments say the unit, the frame, and of each property its channel and wavelength:
+* PLY (binary, little endian): per vertex position, normal, preview colour (red, green, blue: uint8), then every attribute as a float
+  property of its own name; NaN = not seen. The header's comments say the unit, the frame, and of each property its channel and wavelength:
   ``comment property ms_3 channel 572, wavelength_nm 572, linear, 1 = full scale``. Positions are float, or double where that would move
-  them by more than a thousandth of an edge.
+  them by more than a thousandth of an edge. The confidence is called ``quality``, which MeshLab reads (it reads a float ``confidence``
+  wrongly, and no names but its own).
 * GLB: the same as attributes ``_MS_3`` beside POSITION, NORMAL and COLOR_0. glTF has no NaN: what is not seen is 0 there, and ``_VIEWS`` 0
   says so. glTF's own unit is the metre and its up is y; ours stay what they are and stand in the node's extras.
 * OBJ, STL: geometry only.
@@ -23,6 +24,7 @@ from mmsynth.files import write_atomic
 SUFFIXES = (".ply", ".obj", ".stl", ".glb")
 WITH_ATTRIBUTES = (".ply", ".glb")
 FRAME = "the scene's own world frame"
+_PLY_NAMES = {"confidence": "quality"}
 _ROUNDING = 1e-3  # of an edge
 
 
@@ -48,22 +50,25 @@ def write_mesh(mesh: trimesh.Trimesh, path: Path, unit: str | None = None) -> No
     """
     path, suffix = Path(path), check_suffix(path)
     unit = str(mesh.metadata.get("unit", "input unit") if unit is None else unit)
+    plain: Any
     note = f"mmsynth, unit: {unit}, frame: {FRAME}"
     if suffix == ".ply":
         data = _ply(mesh, [note, f"unit {unit}", f"frame {FRAME}"])
     elif suffix == ".glb":
         data = _glb(mesh, unit)
     elif suffix == ".stl":
-        data = _ascii(note).ljust(80)[:80] + trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="stl")[80:]
+        plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        data = _ascii(note).ljust(80)[:80] + plain.export(file_type="stl")[80:]
     else:
         plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, vertex_normals=mesh.vertex_normals)
         data = plain.export(file_type="obj", header=note, digits=9, include_normals=True).encode()
     write_atomic(path, lambda temporary: temporary.write_bytes(data))
 
 
-def has_colours(mesh: trimesh.Trimesh) -> bool:
-    """Whether the mesh was given preview colours."""
-    return bool(mesh.visual.defined and mesh.visual.kind == "vertex")
+def colours_of(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """(V, 4) uint8 preview colours, None where the mesh was given none."""
+    visual: Any = mesh.visual
+    return np.asarray(visual.vertex_colors) if visual.defined and visual.kind == "vertex" else None
 
 
 def _ascii(text: str) -> bytes:
@@ -82,15 +87,16 @@ def _ply(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
     place = _position_type(mesh)
     columns |= {c: (place, mesh.vertices[:, i]) for i, c in enumerate("xyz")}
     columns |= {f"n{c}": ("f4", mesh.vertex_normals[:, i]) for i, c in enumerate("xyz")}
-    if has_colours(mesh):
-        columns |= {c: ("u1", mesh.visual.vertex_colors[:, i]) for i, c in enumerate(("red", "green", "blue"))}
-    columns |= {key: ("f4", value) for key, value in mesh.vertex_attributes.items()}
+    colours = colours_of(mesh)
+    if colours is not None:
+        columns |= {c: ("u1", colours[:, i]) for i, c in enumerate(("red", "green", "blue"))}
+    columns |= {_PLY_NAMES.get(key, key): ("f4", np.asarray(value)) for key, value in mesh.vertex_attributes.items()}
     vertices = np.empty(len(mesh.vertices), [(key, "<" + kind) for key, (kind, _) in columns.items()])
     for key, (_, value) in columns.items():
         vertices[key] = value
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, mesh.faces
-    comments = comments + [f"property {key} {what}" for key, what in mesh.metadata.get("properties", {}).items()]
+    comments = comments + [f"property {_PLY_NAMES.get(key, key)} {what}" for key, what in mesh.metadata.get("properties", {}).items()]
     header = [
         "ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments),
         f"element vertex {len(vertices)}", *(f"property {names[kind]} {key}" for key, (kind, _) in columns.items()),
@@ -100,11 +106,11 @@ def _ply(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
 
 
 def _glb(mesh: trimesh.Trimesh, unit: str) -> bytes:
-    attributes = {key.upper(): np.where(np.isfinite(value), value, 0).astype(np.float32) for key, value in mesh.vertex_attributes.items()}
-    colours = mesh.visual.vertex_colors if has_colours(mesh) else None
+    attributes: dict[str, Any] = {
+        key.upper(): np.where(np.isfinite(value), value, 0).astype(np.float32) for key, value in mesh.vertex_attributes.items()
+    }
     extras: dict[str, Any] = {"unit": unit, "frame": FRAME, "properties": dict(mesh.metadata.get("properties", {}))}
-    plain = trimesh.Trimesh(
-        mesh.vertices, mesh.faces, process=False, vertex_normals=mesh.vertex_normals, vertex_attributes=attributes, vertex_colors=colours,
-        metadata=extras,
-    )  # fmt: skip
+    normals, colours = mesh.vertex_normals, colours_of(mesh)
+    plain: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, None, normals, None, colours, process=False, metadata=extras)
+    plain.vertex_attributes.update(attributes)
     return bytes(plain.export(file_type="glb", include_normals=True))

@@ -31,30 +31,31 @@ from scipy.spatial import cKDTree
 from mmsynth.errors import InputError
 from mmsynth.operations.marching import Distance, checked
 from mmsynth.operations.mesh_attributes import View, small
+from mmsynth.operations.mesh_topology import components, topology
 from mmsynth.sensors.camera import Camera, project
 
 if TYPE_CHECKING:
     from mmsynth.scene.scene import Region
 
 SAMPLES = 300_000
-_SPLAT = 2_000_000  # points that make a depth map
+_SPLAT = 400_000  # points that make the depth maps: several for each of their coarse pixels
 _NEAREST = 8
 _SHARES = (0.005, 0.01, 0.02)  # of the region's radius: the distances of the F-score where none are given
 
 
 def describe(mesh: trimesh.Trimesh, sdf: Distance | None = None, cell: float | None = None) -> dict[str, Any]:
     """Counts, topology and size, ready for JSON; residuals with ``sdf``, also in cells with ``cell`` (scene unit)."""
-    counts = np.bincount(mesh.edges_unique_inverse, minlength=len(mesh.edges_unique))
-    closed = bool((counts == 2).all() and mesh.is_winding_consistent)
+    faces = np.asarray(mesh.faces)
+    found = topology(faces)
     out: dict[str, Any] = {
         "vertices": len(mesh.vertices),
-        "faces": len(mesh.faces),
-        "components": int(mesh.body_count),
-        "watertight": closed,
-        "boundary_edges": int((counts == 1).sum()),
-        "euler_number": int(len(mesh.vertices) - len(counts) + len(mesh.faces)),
+        "faces": found.faces,
+        "components": int(components(faces, len(mesh.vertices)).max()) + 1,
+        "watertight": found.closed,
+        "boundary_edges": found.boundary,
+        "euler_number": found.euler_number,
         "area": float(mesh.area),
-        "volume": float(mesh.volume) if closed else None,
+        "volume": float(mesh.volume) if found.closed else None,
         "bounds": mesh.bounds.tolist(),
         "unit": str(mesh.metadata.get("unit", "input unit")),
     }

@@ -73,7 +73,7 @@ def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
 
 def mesh_text(report: Mapping[str, Any]) -> str:
     """The result of ``mesh`` as lines."""
-    unit, low, high = report["unit"], *report["bounds"]
+    unit, (low, high) = report["unit"], report["bounds"]
     size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
     closed = f"watertight, volume {report['volume']:.4g} {unit}³" if report["watertight"] else f"open, {report['boundary_edges']:,} edges"
     residual = report["residual"]
