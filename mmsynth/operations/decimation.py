@@ -21,7 +21,7 @@ Mesh = tuple[np.ndarray, np.ndarray]
 _AGGRESSION = (3, 2, 4, 5, 1, 7)  # fast-simplification's; how fast its threshold grows. In the order of the errors that they leave
 _LESS = (1.0, 1.02, 1.05, 1.1)  # faces to ask for instead, where nothing sound has so few
 _SHORT = 1.05  # a result with more faces than that share stopped early
-_HALVINGS, _BISECTIONS = 16, 4
+_BISECTIONS = 4
 
 
 def decimate_to(mesh: Mesh, count: int) -> Mesh:
@@ -30,17 +30,13 @@ def decimate_to(mesh: Mesh, count: int) -> Mesh:
     Raises:
         InputError: every result tears the mesh, or presses sheets of it together.
     """
-    vertices, faces = mesh
-    if len(faces) <= count:
-        return mesh
-    simplify = _pymeshlab if importlib.util.find_spec("pymeshlab") else _fast
-    found = simplify(vertices, faces, count)
+    found = _simplified(mesh, count)
     if found is None:
         raise InputError(
-            f"mesh: could not be decimated from {len(faces):,} to {count:,} faces without tearing it, "
+            f"mesh: could not be decimated from {len(mesh[1]):,} to {count:,} faces without tearing it, "
             "expected more faces, or pymeshlab: pip install 'mmsynth[meshlab]'."
         )
-    return used_only(*found)
+    return found
 
 
 def decimate_within(mesh: Mesh, error: Callable[[Mesh], float], largest: float) -> Mesh:
@@ -48,27 +44,32 @@ def decimate_within(mesh: Mesh, error: Callable[[Mesh], float], largest: float) 
 
     Args:
         error: of a mesh; it may move its vertices first. The mesh itself where already its error is larger.
-    Raises:
-        InputError: as ``decimate_to``.
     """
     good, bad = mesh, 0
-    for _ in range(_HALVINGS):
+    while not bad and len(good[1]) >= 8:
         count = len(good[1]) // 2
-        if count < 4:
-            break
-        tried = decimate_to(good, count)
-        if error(tried) > largest or len(tried[1]) > _SHORT * count:
+        tried = _simplified(good, count)
+        if tried is None or len(tried[1]) > _SHORT * count or error(tried) > largest:
             bad = count
-            break
-        good = tried
+        else:
+            good = tried
     for _ in range(_BISECTIONS if bad else 0):
         count = round((bad * len(good[1])) ** 0.5)
-        tried = decimate_to(good, count)
-        if error(tried) > largest:
+        tried = _simplified(good, count)
+        if tried is None or error(tried) > largest:
             bad = count
         else:
             good = tried
     return good
+
+
+def _simplified(mesh: Mesh, count: int) -> Mesh | None:
+    """None where nothing sound was found."""
+    vertices, faces = mesh
+    if len(faces) <= count:
+        return mesh
+    found = (_pymeshlab if importlib.util.find_spec("pymeshlab") else _fast)(vertices, faces, count)
+    return None if found is None else used_only(*found)
 
 
 def _pymeshlab(vertices: np.ndarray, faces: np.ndarray, count: int) -> Mesh | None:
