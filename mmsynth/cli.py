@@ -560,6 +560,27 @@ def bench_twin(
     _print_report(report, as_json)
 
 
+@command("mesh", of=bench_app)
+def bench_mesh(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="run folders, of several budgets for instance")],
+    resolutions: Annotated[str, typer.Option(help="cells across the region of interest")] = "64,128,256,512",
+    methods: Annotated[str | None, typer.Option(help="joined by ';': every block; mmsynth; mmsynth, closed; default: all")] = None,
+    against: Annotated[Path | None, typer.Option(help="the true mesh, in the same frame and unit")] = None,
+    distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002")] = None,
+    out: Annotated[Path, typer.Option()] = Path("bench/mesh"),
+    as_json: JsonOption = False,
+) -> None:
+    """The surface as a mesh: resolution against time, memory and Chamfer distance, beside the usual extraction."""
+    from mmsynth.bench.mesh import bench_mesh as measure
+
+    if not re.fullmatch(r"\d+(,\d+)*", resolutions):
+        raise InputError(f"--resolutions {resolutions!r}: expected numbers such as 128,256.")
+    cells, chosen = [int(n) for n in resolutions.split(",")], None if methods is None else [m.strip() for m in methods.split(";")]
+    with _bar("bench mesh", as_json) as show:
+        report = measure(runs, out, cells, chosen, against, _lengths(distances), progress=show)
+    _print_report(report, as_json)
+
+
 def _print_report(report: Any, as_json: bool) -> None:
     from mmsynth.bench.tables import print_tables
 

@@ -37,8 +37,8 @@ from mmsynth.sensors.camera import Camera, project
 if TYPE_CHECKING:
     from mmsynth.scene.scene import Region
 
-SAMPLES = 300_000
-_SPLAT = 400_000  # points that make the depth maps: several for each of their coarse pixels
+SAMPLES = 200_000
+_SPLAT = 200_000  # points that make the depth maps: several for each of their coarse pixels
 _NEAREST = 8
 _SHARES = (0.005, 0.01, 0.02)  # of the region's radius: the distances of the F-score where none are given
 
@@ -133,6 +133,9 @@ def compare(
     radius = region.radius if region is not None else 0.5 * float(np.linalg.norm(np.ptp(reference.bounds, axis=0)))
     at = [share * radius for share in _SHARES] if distances is None else list(distances)
     ours, true = _Samples(mesh, samples, 0), _Samples(reference, samples, 1)
+    if region is not None:
+        for drawn in (ours, true):
+            drawn.keep(np.linalg.norm(drawn.points - np.array(region.centre), axis=1) <= region.radius)
     if views:
         cameras = [(small(camera), pose) for camera, pose in views]
         of_ours, of_true = (_depth_maps(m, cameras) for m in (mesh, reference))
@@ -140,9 +143,6 @@ def compare(
         seen = np.logical_or.reduce([view.sees(true.points, true.normals) > 0 for view in of_true])
         ours.keep(known)
         true.keep(seen)
-    if region is not None:
-        for drawn in (ours, true):
-            drawn.keep(np.linalg.norm(drawn.points - np.array(region.centre), axis=1) <= region.radius)
     for drawn, name in ((ours, "mesh"), (true, "reference")):
         if not len(drawn.points):
             culled = " that the views see" if views else ""
