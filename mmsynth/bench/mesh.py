@@ -46,7 +46,7 @@ def bench_mesh(
         raise InputError("bench mesh: expected one or more resolutions of at least 2 cells.")
     if against is not None and not against.is_file():
         raise InputError(f"{against}: no such file, expected a mesh to compare with.")
-    budgets = {run: _budget(run) for run in runs}
+    fits = {str(run): _fit(run) for run in runs}
     tasks = [
         {"run": str(run), "resolution": n, "method": method, "against": None if against is None else str(against), "distances": distances}
         for run in runs for n in sorted(resolutions) for method in chosen
@@ -54,17 +54,19 @@ def bench_mesh(
     results: dict[str, Any] = {"bench": "mesh", "machine": measure(), "rows": []}
     for done, task in enumerate(tasks, 1):
         found = in_a_process("mmsynth.bench.mesh_worker", task, f"{task['method']} at {task['resolution']}")
-        results["rows"].append({**task, "budget": budgets[Path(str(task["run"]))], **found})
+        results["rows"].append({**task, **fits[str(task["run"])], **found})
         report = write_report(results, [table_of(results["rows"])], plot(results["rows"]), out)
         if progress is not None:
             progress(done, len(tasks))
     return report
 
 
-def _budget(run: Path) -> str:
+def _fit(run: Path) -> dict[str, Any]:
+    """``budget`` and ``steps`` of a finished fit."""
     if not (run / "manifest.json").is_file():
         raise InputError(f"{run}: holds no finished fit (no manifest.json); run `mmsynth fit SCENE` first.")
-    return budget_name(round(float(read_json(run / "manifest.json")["seconds"]["fit"])))
+    manifest = read_json(run / "manifest.json")
+    return {"budget": budget_name(round(float(manifest["seconds"]["fit"]))), "steps": manifest["steps"]}
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -72,6 +74,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
     f_scores = dict.fromkeys(distance for row in rows for distance in lookup(row, "against/f_score") or ())
     columns = (
         Column("fit", "budget"),
+        Column("steps", "steps", ",d"),
         Column("cells", "resolution", "d"),
         Column("method", "method"),
         Column("seconds", "seconds", ".1f"),

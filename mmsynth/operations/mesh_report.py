@@ -8,6 +8,7 @@ also the residual |f| at the vertices and the middles of faces, in the scene's u
 * ``accuracy``: mean distance of our points to the reference; ``completeness``: of the reference's points to ours; ``chamfer``: their mean.
   Distances are to triangles, not to points: exact up to what the search finds (the triangles of the nearest eight points).
 * ``f_score`` at each distance d: harmonic mean of the shares of points, of ours and of the reference's, that are nearer than d.
+* ``reference_in_region``: share of the reference's area; where it is small, is it in the same unit?
 * ``normal_consistency``: mean cosine between normals at nearest points, both ways, averaged; -1 for a mesh that is inside out.
 
 With views only what can be known is scored, culled alike on both sides:
@@ -133,7 +134,9 @@ def compare(
     radius = region.radius if region is not None else 0.5 * float(np.linalg.norm(np.ptp(reference.bounds, axis=0)))
     at = [share * radius for share in _SHARES] if distances is None else list(distances)
     ours, true = _Samples(mesh, samples, 0), _Samples(reference, samples, 1)
+    inside = 1.0
     if region is not None:
+        inside = float((np.linalg.norm(true.points - np.array(region.centre), axis=1) <= region.radius).mean())
         for drawn in (ours, true):
             drawn.keep(np.linalg.norm(drawn.points - np.array(region.centre), axis=1) <= region.radius)
     if views:
@@ -162,6 +165,7 @@ def compare(
         "f_score": scores,
         "normal_consistency": 0.5 * float(cosine_there.mean() + cosine_back.mean()),
         "points": [len(there), len(back)],
+        "reference_in_region": inside,
         "views": len(views),
     }
 

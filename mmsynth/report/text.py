@@ -89,5 +89,8 @@ def mesh_text(report: Mapping[str, Any]) -> str:
             f"against {scores['mesh']}: accuracy {scores['accuracy']:.4g}, completeness {scores['completeness']:.4g}, Chamfer "
             f"{scores['chamfer']:.4g} {unit}; F-score {f_scores}; normals {scores['normal_consistency']:.3f}"
         )
+        if scores["reference_in_region"] < 0.5:
+            share = f"{scores['reference_in_region']:.0%}"
+            lines.append(f"note: only {share} of the reference lies in the region of interest; is it in the mesh's frame and in {unit}?")
     lines.append("seconds: " + ", ".join(f"{key} {value:.1f}" for key, value in report["seconds"].items()))
     return "\n".join(lines)

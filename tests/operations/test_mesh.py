@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from analytic import MONO, AnalyticField, Distance, sphere, torus
 from hypothesis import given, settings
@@ -14,6 +15,8 @@ from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
 from mmsynth.errors import InputError
+from mmsynth.field.field import Design, Field
+from mmsynth.field.rendering import Sampling
 from mmsynth.operations.marching import march, steepest
 from mmsynth.operations.mesh import extract_mesh, settle
 from mmsynth.operations.mesh_report import describe
@@ -77,6 +80,24 @@ def test_no_part_of_the_dense_surface_is_lost(distance: Distance, n: int) -> Non
     v, _ = march(distance, UNIT, n, 16)
     whole, _ = dense(distance, n)
     assert crossed(v) == crossed(whole) and len(crossed(v)) > 500
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_part_of_a_learned_field_is_lost(seed: int) -> None:
+    """A network on a hash grid with random features: no distance, steep and flat, pieces everywhere."""
+    n = 64
+    design = Design(surface_levels=3, surface_finest=24, coarsest=6, radiance_levels=1, radiance_finest=4, initial_radius=0.5)
+    field = Field(design, {"mono": MONO}, {"mono": 0.5}, UNIT)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        field.surface.grid.table.uniform_(-0.3, 0.3, generator=generator)
+        field.surface.last[:-1].uniform_(-0.5, 0.5, generator=generator)
+    field.sampling = Sampling(20.0, 0.05, 3, 1)
+    mesh = extract_mesh(field, n, 16, keep="all", closed=True)
+    distance = lambda p: np.maximum(field.sdf(p.reshape(-1, 3)), np.linalg.norm(p.reshape(-1, 3), axis=1) - 1).reshape(p.shape[:-1])
+    whole = trimesh.Trimesh(*dense(distance, n), process=False)
+    assert mesh.is_watertight and len(mesh.faces) == pytest.approx(len(whole.faces), rel=1e-3)
+    assert mesh.body_count == whole.body_count > 3
 
 
 @settings(max_examples=15, deadline=None)

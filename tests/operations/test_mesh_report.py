@@ -83,6 +83,7 @@ def test_only_the_region_counts() -> None:
     both = trimesh.util.concatenate([ball(0.3), ball(0.3, (3.0, 0.0, 0.0))])
     assert compare(ball(0.3), both, samples=20_000)["completeness"] > 1.0
     scores = compare(ball(0.3), both, Region((0.0, 0.0, 0.0), 1.0), samples=20_000)
+    assert scores["reference_in_region"] == pytest.approx(0.5, abs=0.02)
     assert scores["chamfer"] < 1e-4 and scores["points"][1] == pytest.approx(10_000, rel=0.05)
     with pytest.raises(InputError, match="nothing of the mesh in the region"):
         compare(ball(0.3), both, Region((9.0, 0.0, 0.0), 1.0), samples=1000)
