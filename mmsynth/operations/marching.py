@@ -90,6 +90,7 @@ class _Lattice:
         # a field without any slope has no surface; its values stay what they are
         self.tiny = np.float32(_SNAP * self.h * self.bound) if self.bound > 0 else np.finfo(np.float32).tiny
         self.shared: dict[tuple[int, ...], np.ndarray] = {}
+        self.slab = 0
 
     def world(self, lattice: np.ndarray) -> np.ndarray:
         """Lattice coordinates (..., 3) → world."""
@@ -151,8 +152,10 @@ class _Lattice:
 
     def agree(self, values: np.ndarray, index: tuple[int, ...]) -> None:
         """Give lattice points on the hull of block ``index`` the values that earlier blocks have for them."""
-        for key in [key for key in self.shared if key[0] < 2 * index[0]]:
-            del self.shared[key]  # blocks come in order: none that touches these is left
+        if index[0] > self.slab:
+            # blocks come slab by slab: of those before, only the plane between is still asked for
+            self.shared = {key: known for key, known in self.shared.items() if key[0] >= 2 * index[0]}
+            self.slab = index[0]
         sides = (slice(0, 1), slice(1, -1), slice(-1, None))
         for place in itertools.product(range(3), repeat=3):
             if place == (1, 1, 1):
@@ -240,11 +243,11 @@ def march(sdf: Distance, region: Region, n: int, block: int, progress: Progress 
         lattice.agree(values, tuple(int(i) for i in index))
         if values.min() < 0 < values.max():
             v, f, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
-            vertices.append(v.astype(np.float64) + low)
+            vertices.append(_refine(lattice, v.astype(np.float64) + low))
             faces.append(f.astype(np.int64) + total)
             total += len(v)
         if progress is not None:
             progress(done, len(active))
     v, f = _weld(np.concatenate(vertices), np.concatenate(faces), n)
     f = f[(f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])]
-    return lattice.world(_refine(lattice, v)), f
+    return lattice.world(v), f

@@ -62,5 +62,6 @@ def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
 
 def used_only(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without the vertices that no face has."""
-    used, compact = np.unique(faces, return_inverse=True)
-    return vertices[used], compact.reshape(-1, 3)
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
