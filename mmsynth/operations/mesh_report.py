@@ -6,12 +6,13 @@ also the residual |f| at the vertices and the middles of faces, in the scene's u
 ``compare``: a mesh against a reference in the same frame and unit, by points drawn evenly over both areas:
 
 * ``accuracy``: mean distance of our points to the reference; ``completeness``: of the reference's points to ours; ``chamfer``: their mean.
-  Distances are to triangles, not to points: exact up to what the search finds (the triangles of the nearest eight points).
+  Distances are to triangles of the whole other mesh, not to points: to those whose middle, or a point on them, is among the nearest
+  eight.
 * ``f_score`` at each distance d: harmonic mean of the shares of points, of ours and of the reference's, that are nearer than d.
 * ``reference_in_region``: share of the reference's area; where it is small, is it in the same unit?
 * ``normal_consistency``: mean cosine between normals at nearest points, both ways, averaged; -1 for a mesh that is inside out.
 
-With views only what can be known is scored, culled alike on both sides:
+With views only what can be known is scored. The points of both meshes are culled:
 
 * to the region's ball;
 * to what the views see: a point must face a view and be the first thing along its ray, by a depth map of the mesh's own points;
@@ -134,6 +135,7 @@ def compare(
     radius = region.radius if region is not None else 0.5 * float(np.linalg.norm(np.ptp(reference.bounds, axis=0)))
     at = [share * radius for share in _SHARES] if distances is None else list(distances)
     ours, true = _Samples(mesh, samples, 0), _Samples(reference, samples, 1)
+    to_ours, to_true = _Triangles(ours), _Triangles(true)
     inside = 1.0
     if region is not None:
         inside = float((np.linalg.norm(true.points - np.array(region.centre), axis=1) <= region.radius).mean())
@@ -150,8 +152,8 @@ def compare(
         if not len(drawn.points):
             culled = " that the views see" if views else ""
             raise InputError(f"mesh: nothing of the {name} in the region{culled}; is the reference in the mesh's frame and unit?")
-    there, cosine_there = _nearest(ours, true)
-    back, cosine_back = _nearest(true, ours)
+    there, cosine_there = to_true.nearest(ours)
+    back, cosine_back = to_ours.nearest(true)
     scores = {}
     for d in at:
         precision, recall = float((there <= d).mean()), float((back <= d).mean())
@@ -170,22 +172,30 @@ def compare(
     }
 
 
-def _nearest(of: _Samples, to: _Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) of points to the triangles that the other points lie on, and the cosine between the normals there."""
-    count = min(_NEAREST, len(to.points))
-    _, found = cKDTree(to.points).query(of.points, k=count)
-    found = found.reshape(len(of.points), count)
-    best = np.full(len(of.points), np.inf)
-    cosine = np.zeros(len(of.points))
-    triangles = to.mesh.triangles
-    for k in range(count):
-        rows = found[:, k]
-        closest = trimesh.triangles.closest_point(triangles[to.face[rows]], of.points)
-        distance = np.linalg.norm(closest - of.points, axis=1)
-        nearer = distance < best
-        best[nearer] = distance[nearer]
-        cosine[nearer] = np.einsum("ni,ni->n", of.normals[nearer], to.normals[rows[nearer]])
-    return best, cosine
+class _Triangles:
+    """Finds the nearest point of a mesh: small triangles by their middles, large ones by the samples on them."""
+
+    def __init__(self, samples: _Samples) -> None:
+        self.triangles = samples.mesh.triangles
+        self.face = np.concatenate([samples.face, np.arange(len(self.triangles))])
+        self.tree = cKDTree(np.concatenate([samples.points, self.triangles.mean(1)]))
+        cross = np.cross(self.triangles[:, 1] - self.triangles[:, 0], self.triangles[:, 2] - self.triangles[:, 0])
+        length = np.linalg.norm(cross, axis=1, keepdims=True)
+        # a triangle without an area has no normal, and agrees with nobody
+        self.normals = np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+
+    def nearest(self, of: _Samples) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (N,) of points, and the cosine between the normals there."""
+        _, found = self.tree.query(of.points, k=_NEAREST)
+        best, cosine = np.full(len(of.points), np.inf), np.zeros(len(of.points))
+        for k in range(_NEAREST):
+            face = self.face[found[:, k]]
+            closest = trimesh.triangles.closest_point(self.triangles[face], of.points)
+            distance = np.linalg.norm(closest - of.points, axis=1)
+            nearer = distance < best
+            best[nearer] = distance[nearer]
+            cosine[nearer] = np.einsum("ni,ni->n", of.normals[nearer], self.normals[face[nearer]])
+        return best, cosine
 
 
 def _depth_maps(mesh: trimesh.Trimesh, cameras: Sequence[tuple[Camera, np.ndarray]]) -> list[View]:
