@@ -16,8 +16,8 @@ Attributes, float32, NaN where no ray reached the vertex:
   ``<modality>_axis_x, _y, _z``: the axis along which it swings, a unit vector in world space (its sign has no meaning), the first
   eigenvector of T = Σ p S0 e eᵀ. Angles are never averaged. ``<modality>_axis_share``: λ₁ / tr T, 1 where all rays agree on the axis,
   1/3 where it is anywhere. Each ray's polarization is perpendicular to it, so axes of different views differ a little by necessity.
-* ``views``: how many training views see the vertex. ``spread``: standard deviation of the rays' light (mean of all channels, each by its
-  modality's mean) over its mean: large where the surface shines, or is in the wrong place.
+* ``views``: how many training views see the vertex. ``spread``: standard deviation of the rays' light (the mean over modalities of
+  their mean channel, S0 of polarization) over its mean: large where the surface shines, or is in the wrong place.
 * ``confidence`` in [0, 1]: views / (views + 8) · 1 / (1 + spread / 4) · 1 / (1 + residual / 0.1), with the residual |f| / cell at the
   vertex; 0 where no view sees it. It orders vertices and is no probability: in that room, the median distance to the true surface fell with
   it, most of that by the number of views.
