@@ -103,6 +103,18 @@ def _seeds(text: str) -> list[int]:
     return [int(seed) for seed in text.split(",")]
 
 
+def _lengths(text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or not all(0 < x < float("inf") for x in found):
+        raise InputError(f"--distances {text!r}: expected lengths above 0 such as 0.001,0.002.")
+    return found
+
+
 def _seconds(text: str, option: str = "--budget") -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|h)?", text.strip())
     if not match or float(match[1]) <= 0:
@@ -519,23 +531,32 @@ def calibrate_noise(
 @command("mesh")
 def mesh(
     run: RunOption = None,
-    resolution: Annotated[int, typer.Option(min=8, max=4096, help="voxels across the region of interest")] = 256,
-    out: Annotated[Path | None, typer.Option(help="PLY, OBJ, STL or GLB; default: RUN/mesh.ply")] = None,
+    resolution: Annotated[int, typer.Option(min=8, max=8192, help="cells across the region of interest")] = 256,
+    out: Annotated[Path | None, typer.Option(help="PLY, GLB, OBJ or STL; default: RUN/mesh.ply")] = None,
+    closed: Annotated[bool, typer.Option("--closed", help="close the surface where the region's border cuts it")] = False,
+    keep: Annotated[str, typer.Option(help="components: clean (no specks), all, largest, or how many")] = "clean",
+    min_views: Annotated[int, typer.Option(min=0, help="keep components only that so many training views see")] = 0,
+    faces: Annotated[int | None, typer.Option(min=4, help="decimate to so many")] = None,
+    max_error: Annotated[float | None, typer.Option(help="or as far as 99.9 % of it stays that near [unit]")] = None,
+    geometry_only: Annotated[bool, typer.Option("--geometry-only", help="no colours and no modalities on the vertices")] = False,
+    against: Annotated[Path | None, typer.Option(help="score it against this mesh, in the same frame and unit")] = None,
+    distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002; default: 0.5, 1 and 2 % of the radius")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The surface, in the input's frame and unit."""
-    from mmsynth.operations.mesh import extract_mesh, write_mesh
+    """The surface with every modality on it, in the input's frame and unit."""
+    from mmsynth.operations.mesh import mesh_to_file
+    from mmsynth.report.text import mesh_text
 
-    folder, field = _load_field(run)
-    destination = out or folder / "mesh.ply"
-    with _bar("mesh", as_json) as show:
-        surface = extract_mesh(field, resolution, progress=show)
-    write_mesh(surface, destination, field.unit)
-    counts = {"vertices": len(surface.vertices), "faces": len(surface.faces)}
-    if as_json:
-        print(json.dumps({"out": str(destination), **counts, "bounds": surface.bounds.tolist(), "unit": field.unit}))
+    if geometry_only and not min_views and against is None:
+        (folder, field), scene = _load_field(run), None  # the scene may be elsewhere
     else:
-        print(f"wrote {destination}: {counts['vertices']:,} vertices, {counts['faces']:,} faces, in {field.unit}")
+        folder, field, scene = _load(run)
+    destination, at = out or folder / "mesh.ply", _lengths(distances)
+    with _bar("mesh", as_json) as show:
+        report = mesh_to_file(
+            field, destination, resolution, keep, closed, scene, not geometry_only, min_views, faces, max_error, against, at, show
+        )
+    print(json.dumps(report) if as_json else mesh_text(report))
 
 
 @command("doctor")
@@ -657,6 +678,27 @@ def bench_render(
     _, field, scene = _load(run)
     with _bar("bench render", as_json) as show:
         report = measure(field, scene, out, None if only is None else [name.strip() for name in only.split(",")], threads, repeats, show)
+    _print_report(report, as_json)
+
+
+@command("mesh", of=bench_app)
+def bench_mesh(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="run folders, of several budgets for instance")],
+    resolutions: Annotated[str, typer.Option(help="cells across the region of interest")] = "64,128,256,512",
+    methods: Annotated[str | None, typer.Option(help="joined by ';': every block; mmsynth; mmsynth, closed; default: all")] = None,
+    against: Annotated[Path | None, typer.Option(help="the true mesh, in the same frame and unit")] = None,
+    distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002")] = None,
+    out: Annotated[Path, typer.Option()] = Path("bench/mesh"),
+    as_json: JsonOption = False,
+) -> None:
+    """The surface as a mesh: resolution against time, memory and Chamfer distance, beside the usual extraction."""
+    from mmsynth.bench.mesh import bench_mesh as measure
+
+    if not re.fullmatch(r"\d+(,\d+)*", resolutions):
+        raise InputError(f"--resolutions {resolutions!r}: expected numbers such as 128,256.")
+    cells, chosen = [int(n) for n in resolutions.split(",")], None if methods is None else [m.strip() for m in methods.split(";")]
+    with _bar("bench mesh", as_json) as show:
+        report = measure(runs, out, cells, chosen, against, _lengths(distances), progress=show)
     _print_report(report, as_json)
 
 

@@ -20,6 +20,7 @@ _PACKAGES = (
     "opencv-contrib-python-headless",
     "scikit-image",
     "trimesh",
+    "fast-simplification",
     "pymeshlab",
     "triton",
     "mitsuba",

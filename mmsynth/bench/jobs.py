@@ -101,13 +101,22 @@ def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -
 
 
 def run_job(job: Job) -> dict[str, Any]:
-    """Fit and score in a fresh process (``mmsynth.bench.worker``), which ends when this one does.
+    """Fit and score in a fresh process (``mmsynth.bench.worker``).
 
     Raises:
         InputError: the fit was refused or its process died.
     """
+    return in_a_process("mmsynth.bench.worker", job.task(), job.name)
+
+
+def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """What a module that ends in ``worker.serve`` makes of a task (ready for JSON), in a fresh process, which ends when this one does.
+
+    Raises:
+        InputError: the task was refused or its process died.
+    """
     with tempfile.TemporaryDirectory(prefix="mmsynth-bench-") as folder, open(Path(folder) / "stderr", "w+b") as said:
-        command = [sys.executable, "-m", "mmsynth.bench.worker", json.dumps(job.task()), folder]
+        command = [sys.executable, "-m", module, json.dumps(task), folder]
         path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, "PYTHONPATH": path}
         # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result
@@ -119,7 +128,7 @@ def run_job(job: Job) -> dict[str, Any]:
         lines = said.read().decode(errors="replace").strip().splitlines() or ["it said nothing"]
         if status == 2 and lines[-1].startswith("error: "):
             raise InputError(lines[-1].removeprefix("error: "))
-        raise InputError(f"{job.name}: its process ended with status {status} instead of a score ({lines[-1]}).")
+        raise InputError(f"{name}: its process ended with status {status} instead of a score ({lines[-1]}).")
 
 
 def identity(job: Job, scene: str) -> dict[str, Any]:

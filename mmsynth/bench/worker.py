@@ -11,7 +11,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +60,9 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Read the arguments, work, write; an ``InputError`` becomes one sentence and exit code 2."""
+def serve(work: Callable[[Mapping[str, Any], Path], dict[str, Any]]) -> None:
+    """Read the arguments, work on the task (in a folder that is thrown away), write the result; an ``InputError`` becomes one sentence and
+    exit code 2."""
 
     def end_with_the_parent() -> None:
         while os.read(0, 1):
@@ -78,4 +79,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    serve(work)

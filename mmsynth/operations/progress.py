@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator, Sequence
 
 Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)``; the unit (rays, blocks, ...) is the operation's."""
@@ -18,3 +19,16 @@ class Counter:
         self.done += more
         if self.progress is not None:
             self.progress(self.done, self.total)
+
+
+def parts(progress: Progress | None, shares: Sequence[float]) -> Iterator[Progress | None]:
+    """One callback for each of several parts of an operation; ``shares``: of its time, their sum is 1."""
+    begin, whole = 0.0, 1000
+
+    def part(begin: float, share: float, done: int, total: int) -> None:
+        if progress is not None:
+            progress(round(whole * (begin + share * done / max(total, 1))), whole)
+
+    for share in shares:
+        yield None if progress is None else functools.partial(part, begin, share)
+        begin += share

@@ -69,3 +69,28 @@ def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
             f"{pair(100 * p.prnu, 100 * p.prnu_sd, 2):>14s}"
         )
     return "\n".join(lines)
+
+
+def mesh_text(report: Mapping[str, Any]) -> str:
+    """The result of ``mesh`` as lines."""
+    unit, (low, high) = report["unit"], report["bounds"]
+    size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
+    closed = f"watertight, volume {report['volume']:.4g} {unit}³" if report["watertight"] else f"open, {report['boundary_edges']:,} edges"
+    residual = report["residual"]
+    lines = [
+        f"wrote {report['out']}: {report['vertices']:,} vertices, {report['faces']:,} faces, in {unit}",
+        f"{report['components']} component{'s' * (report['components'] != 1)}, {closed}, Euler number {report['euler_number']}",
+        f"{size} {unit}, cells of {report['cell']:.3g}, vertices {residual['rms_cells']:.1e} cells off the field's zero (rms)",
+    ]
+    if "against" in report:
+        scores = report["against"]
+        f_scores = ", ".join(f"{value:.3f} at {distance}" for distance, value in scores["f_score"].items())
+        lines.append(
+            f"against {scores['mesh']}: accuracy {scores['accuracy']:.4g}, completeness {scores['completeness']:.4g}, Chamfer "
+            f"{scores['chamfer']:.4g} {unit}; F-score {f_scores}; normals {scores['normal_consistency']:.3f}"
+        )
+        if scores["reference_in_region"] < 0.5:
+            share = f"{scores['reference_in_region']:.0%}"
+            lines.append(f"note: only {share} of the reference lies in the region of interest; is it in the mesh's frame and in {unit}?")
+    lines.append("seconds: " + ", ".join(f"{key} {value:.1f}" for key, value in report["seconds"].items()))
+    return "\n".join(lines)

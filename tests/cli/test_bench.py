@@ -122,3 +122,22 @@ def test_bench_render(tmp_path: Path) -> None:
     refused(call("bench", "render", "--only", "magic"), "'magic'", "termination")
     refused(call("bench", "render", "--run", "nowhere"), "nowhere", "no finished fit")
     refused(call("bench", "render", "--threads", "99999"), "--threads")
+
+
+def test_bench_mesh(tmp_path: Path) -> None:
+    assert call("fit", "example", "--steps", "25", "--modalities", "rgb", "--run", "run", "--json").exit_code == 0
+    assert call("mesh", "--run", "run", "--resolution", "24", "--geometry-only", "--out", "true.ply", "--json").exit_code == 0
+    args = ("--resolutions", "24", "--methods", "every block; mmsynth, closed", "--against", "true.ply", "--distances", "0.01", "--json")
+    result = call("bench", "mesh", "run", *args)
+    assert result.exit_code == 0, result.output
+    usual, ours = json.loads(result.stdout)["rows"]
+    assert (usual["method"], ours["method"]) == ("every block", "mmsynth, closed")
+    assert ours["mesh"]["watertight"] and ours["mesh"]["volume"] > 0
+    for row in (usual, ours):
+        assert row["resolution"] == 24 and row["seconds"] > 0 and row["peak_memory_bytes"] > 1e7
+        assert row["against"]["accuracy"] < 0.27 / 24 and set(row["against"]["f_score"]) == {"0.01"}
+    assert {path.name for path in (tmp_path / "bench" / "mesh").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    refused(call("bench", "mesh", "run", "--methods", "magic"), "'magic'", "every block")
+    refused(call("bench", "mesh", "nowhere"), "nowhere", "no finished fit")
+    refused(call("bench", "mesh", "run", "--resolutions", "fine"), "fine", "128,256")
+    refused(call("bench", "mesh", "run", "--against", "gt.ply"), "gt.ply")

@@ -264,11 +264,21 @@ def test_calibrate_noise(fitted: Path, tmp_path: Path) -> None:
 def test_mesh(fitted: Path) -> None:
     import trimesh
 
-    result = run(fitted, "mesh", "--resolution", "48", "--json")
+    result = run(fitted, "mesh", "--resolution", "48", "--closed", "--keep", "all", "--json")
     assert result.returncode == 0, result.stderr
-    mesh = trimesh.load(fitted / "runs/latest/mesh.ply")
-    assert len(mesh.faces) == json.loads(result.stdout)["faces"] > 100
+    mesh = trimesh.load(fitted / "runs/latest/mesh.ply", process=False)
+    report = json.loads(result.stdout)
+    assert len(mesh.faces) == report["faces"] > 100
+    assert report["watertight"] and mesh.is_watertight and mesh.volume == pytest.approx(report["volume"], rel=1e-4)
+    assert report["residual"]["rms_cells"] < 1e-3 and report["unit"] == "m" and set(report["seconds"]) == {"extract", "report", "write"}
     assert np.abs(mesh.vertices - np.array([0.0, 0.0, 0.105])).max() < 0.28  # metres, in the scene's own frame
+    names = mesh.metadata["_ply_raw"]["vertex"]["data"].dtype.names
+    assert {"rgb_0", "ms_8", "pol_dolp", "pol_axis_x", "nir_0", "quality", "views"} <= set(names)
+    assert b"comment unit m\n" in (fitted / "runs/latest/mesh.ply").read_bytes()[:5000]
+    again = run(
+        fitted, "mesh", "--resolution", "48", "--geometry-only", "--out", "a.obj", "--against", "runs/latest/mesh.ply", "--faces", "600"
+    )
+    assert again.returncode == 0 and "wrote a.obj" in again.stdout and "F-score" in again.stdout, again.stderr
 
 
 def test_doctor(tmp_path: Path) -> None:
@@ -320,6 +330,10 @@ def test_bad_requests_on_a_run_are_refused(fitted: Path) -> None:
     refused(run(fitted, "convert", "--from", "rgb,ms", "--to", "pol"), "rgb,ms")
     refused(run(fitted, "generate-dataset", "--poses", "missing.json"), "missing.json")
     refused(run(fitted, "mesh", "--out", "mesh.xyz", "--resolution", "16"), "mesh.xyz")
+    refused(run(fitted, "mesh", "--against", "gt.ply", "--resolution", "16"), "gt.ply")
+    refused(run(fitted, "mesh", "--keep", "some", "--resolution", "16"), "'some'", "largest")
+    refused(run(fitted, "mesh", "--distances", "near", "--resolution", "16"), "near", "0.001,0.002")
+    refused(run(fitted, "mesh", "--min-views", "99", "--geometry-only", "--resolution", "16"), "99", "training views")
     (fitted / "nan.json").write_text('{"convention": "OpenCV", "rig": [[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]}')
     refused(run(fitted, "generate-dataset", "--poses", "nan.json"), "nan.json")
 

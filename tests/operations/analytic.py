@@ -59,14 +59,14 @@ class AnalyticField:
         self.rig = {s.name: np.eye(4) for s in sensors}
         for i, s in enumerate(sensors):
             self.rig[s.name][0, 3] = 0.05 * i
-        self.largest_query = 0
+        self.points = 0  # that were asked for
         self.renders = 0
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         return {"value": torch.from_numpy(self.sdf(np.eye(3)))}
 
     def sdf(self, points: np.ndarray) -> np.ndarray:
-        self.largest_query = max(self.largest_query, len(points))
+        self.points += len(points)
         return self.distance(np.asarray(points, float)).astype(np.float32)
 
     check_modalities = Field.check_modalities
@@ -79,6 +79,29 @@ class AnalyticField:
         slope = np.stack([self.distance(p + e) - self.distance(p - e) for e in step], -1)
         return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
 
+    def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
+        """Rays of one camera, as ``Field.cast``."""
+        direction, origin = directions @ camera_to_world[:3, :3].T, camera_to_world[:3, 3]
+        t = np.zeros(len(directions))
+        for _ in range(100):
+            t += np.clip(self.distance(origin + direction * t[:, None]), -1, 1)
+        point = origin + direction * t[:, None]
+        hit = (np.abs(self.distance(point)) < 1e-4) & (t > 0)
+        normal = self.normal(point)
+        light = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
+        shade = np.where(hit, 0.15 + 0.6 * np.clip(normal @ light, 0, None), 0.05)
+        out = {"opacity": hit, "depth": np.where(hit, t / self.region.radius, np.nan), "normal": np.where(hit[:, None], normal, np.nan)}
+        for name in modalities:
+            sensor = self.sensors[name]
+            out[name] = shade[:, None] * np.linspace(1.0, 0.5, sensor.channel_count)
+            if sensor.polarizer_angles_deg is not None:
+                phi = np.arctan2(-(normal @ camera_to_world[:3, 1]), normal @ camera_to_world[:3, 0])
+                dolp = np.where(hit, 0.3, 0.0)
+                s = np.stack([shade, shade * dolp * np.cos(2 * phi), shade * dolp * np.sin(2 * phi)], -1)
+                out[f"stokes/{name}"] = s
+                out[name] = stokes_to_intensities(torch.from_numpy(s), sensor.polarizer_angles_deg).numpy()
+        return {key: value.astype(np.float32) for key, value in out.items()}
+
     def render(
         self,
         camera: Camera,
@@ -90,37 +113,18 @@ class AnalyticField:
         names = self.check_modalities(modalities)
         self.renders += 1
         in_camera, valid = ray_map(camera)
-        direction = in_camera @ camera_to_world[:3, :3].T
-        t = np.zeros(valid.shape)
-        for _ in range(100):
-            t += np.clip(self.distance(camera_to_world[:3, 3] + direction * t[..., None]), -1, 1)
-        point = camera_to_world[:3, 3] + direction * t[..., None]
-        hit = valid & (np.abs(self.distance(point)) < 1e-4) & (t > 0)
-        normal = self.normal(point)
-        light = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
-        shade = np.where(hit, 0.15 + 0.6 * np.clip(normal @ light, 0, None), 0.05)
-        channels, stokes = {}, {}
-        for name in names:
-            sensor = self.sensors[name]
-            gain = np.linspace(1.0, 0.5, sensor.channel_count)
-            value = shade[..., None] * gain
-            if sensor.polarizer_angles_deg is not None:
-                phi = np.arctan2(-(normal @ camera_to_world[:3, 1]), normal @ camera_to_world[:3, 0])
-                dolp = np.where(hit, 0.3, 0.0)
-                s = np.stack([shade, shade * dolp * np.cos(2 * phi), shade * dolp * np.sin(2 * phi)], -1)
-                stokes[name] = np.where(valid[..., None], s, np.nan).astype(np.float32)
-                value = stokes_to_intensities(torch.from_numpy(s), sensor.polarizer_angles_deg).numpy()
-            channels[name] = np.where(valid[..., None], value, np.nan).astype(np.float32)
+        cast = self.cast(in_camera.reshape(-1, 3), camera_to_world, names, geometry)
+        image = {key: np.where(valid[..., None], value.reshape(*valid.shape, -1), np.nan) for key, value in cast.items()}
         if progress is not None:
             progress(int(valid.sum()))
-        depth = np.where(hit, t, np.nan).astype(np.float32)
+        depth = image["depth"][..., 0] * np.float32(self.region.radius)
         return Rendering(
-            channels,
-            stokes,
+            {name: image[name] for name in names},
+            {name: image[f"stokes/{name}"] for name in names if f"stokes/{name}" in image},
             (depth * in_camera[..., 2]).astype(np.float32),
             depth,
-            np.where(hit[..., None], normal, np.nan).astype(np.float32),
-            hit.astype(np.float32),
+            image["normal"],
+            np.nan_to_num(image["opacity"][..., 0]),
             valid.copy(),
         )
 
