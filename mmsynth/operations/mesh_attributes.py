@@ -38,6 +38,7 @@ import trimesh
 
 from mmsynth.errors import InputError
 from mmsynth.operations import previews
+from mmsynth.operations.coverage import resized
 from mmsynth.operations.progress import Counter, Progress, parts
 from mmsynth.sensors.camera import Camera, project
 from mmsynth.sensors.polarization import reference_axes
@@ -69,16 +70,9 @@ def views_of(field: Field, scene: Scene) -> list[tuple[Camera, np.ndarray]]:
     return [frames[view] for view in sorted(frames)]
 
 
-def small(camera: Camera, columns: int = _COLUMNS) -> Camera:
-    """The same view on a grid of at most so many columns."""
-    scale = max(camera.width / columns, 1.0)
-    if scale == 1.0:
-        return camera
-    width, height = round(camera.width / scale), max(round(camera.height / scale), 1)
-    sx, sy = width / camera.width, height / camera.height
-    # pixel centres are whole numbers: the image begins at -1/2
-    cx, cy = (camera.cx + 0.5) * sx - 0.5, (camera.cy + 0.5) * sy - 0.5
-    return Camera(width, height, camera.fx * sx, camera.fy * sy, cx, cy, camera.distortion, camera.lens)
+def small(camera: Camera) -> Camera:
+    """The same view on the grid of a depth map."""
+    return resized(camera, min(_COLUMNS, camera.width))
 
 
 @dataclass(frozen=True)

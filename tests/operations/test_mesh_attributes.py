@@ -140,8 +140,8 @@ def test_a_view_sees_what_faces_it_in_its_image_and_is_not_behind(tmp_path: Path
 
 def test_small_cameras_look_the_same_way() -> None:
     camera = Camera(1000, 700, 900.0, 880.0, 510.0, 340.0, (-0.1, 0.02, 1e-3, 0.0))
-    coarse = small(camera, 160)
-    assert (coarse.width, coarse.height) == (160, 112) and small(coarse, 160) is coarse
+    coarse = small(camera)
+    assert (coarse.width, coarse.height) == (160, 112) and small(coarse) == coarse
     rays = ray_map(coarse)[0][::20, ::20].reshape(-1, 3)
     at, fine = project(rays, coarse), project(rays, camera)
     assert np.abs((at + 0.5) * [1000 / 160, 700 / 112] - 0.5 - fine).max() < 1e-6
