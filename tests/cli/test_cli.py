@@ -1,4 +1,4 @@
-"""The commands as a user runs them: in a folder of their own, as a subprocess, on the packaged example scene."""
+"""The commands as a user runs them: in a folder of their own, on the packaged example scene; each once as a process of its own."""
 
 import json
 import os
@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from mmsynth.cli import app
 from mmsynth.data import data_folder
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +27,19 @@ def run(cwd: Path, *args: str, largest_file: int | None = None, **variables: str
     return subprocess.run(
         [sys.executable, "-m", "mmsynth", *args], cwd=cwd, env=environment, capture_output=True, text=True, preexec_fn=limit
     )
+
+
+def here(cwd: Path, *args: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """The same in this process: importing torch anew takes seconds."""
+    before = Path.cwd()
+    os.chdir(cwd)
+    try:
+        result = CliRunner(env={"COLUMNS": "200", **variables}).invoke(app, args)
+    finally:
+        os.chdir(before)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return subprocess.CompletedProcess(args, result.exit_code, result.stdout, result.stderr)
 
 
 def refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -60,9 +75,9 @@ def test_fit_leaves_a_run(fitted: Path) -> None:
 
 
 def test_info(tmp_path: Path) -> None:
-    result = run(tmp_path, "info", "example")
+    result = here(tmp_path, "info", "example")
     assert result.returncode == 0 and "ms" in result.stdout and "24 frames" in result.stdout.replace("frames    24", "24 frames")
-    assert set(json.loads(run(tmp_path, "info", "example", "--json").stdout)["sensors"]) == {"rgb", "nir", "mono", "pol", "ms"}
+    assert set(json.loads(here(tmp_path, "info", "example", "--json").stdout)["sensors"]) == {"rgb", "nir", "mono", "pol", "ms"}
 
 
 def test_evaluate(fitted: Path) -> None:
@@ -82,13 +97,13 @@ def test_convert(fitted: Path) -> None:
     (file,) = (fitted / "runs/latest/convert/rgb_to_ms").rglob("*.npz")
     found = np.load(file)
     assert found["data"].shape == (72, 96, 9) and found["confidence"].shape == (72, 96)
-    own = run(fitted, "convert", "--from", "rgb", "--to", "nir", "--views", "9", "--method", "ratio", "--as-sensor", "--out", "own")
+    own = here(fitted, "convert", "--from", "rgb", "--to", "nir", "--views", "9", "--method", "ratio", "--as-sensor", "--out", "own")
     assert own.returncode == 0 and (fitted / "own/nir/0009.npz").is_file(), own.stderr
     frame = next((data_folder("example_scene") / "modalities" / "rgb").glob("*9.png"))
     # a fit of 25 steps has no surface to find a frame by
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--images", str(frame)), frame.name)
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--images", str(frame), "--views", "9"), "--images")
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--method", "magic"), "magic", "guided")
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "ms", "--images", str(frame)), frame.name)
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "ms", "--images", str(frame), "--views", "9"), "--images")
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "ms", "--method", "magic"), "magic", "guided")
 
 
 def test_every_public_name_is_there() -> None:
@@ -100,11 +115,11 @@ def test_every_public_name_is_there() -> None:
 def test_convert_at_poses(fitted: Path, tmp_path: Path) -> None:
     (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 2}))
     orbit = ("--poses", str(tmp_path / "orbit.json"))
-    result = run(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--format", "exr", "--out", "orbit", "--json")
+    result = here(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--format", "exr", "--out", "orbit", "--json")
     assert result.returncode == 0, result.stderr
     assert {"0000.exr", "0001.exr", "0001.json"} < {Path(p).name for p in json.loads(result.stdout)["files"]}
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--method", "guided"), "needs frames of rgb")
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--views", "9"), "--views", "--poses")
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--method", "guided"), "needs frames of rgb")
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--views", "9"), "--views", "--poses")
 
 
 def test_evaluate_conversions(fitted: Path) -> None:
@@ -114,10 +129,10 @@ def test_evaluate_conversions(fitted: Path) -> None:
     assert (first["source"], first["target"], first["truth"], first["auto"]) == ("rgb", "ms", "aligned", "guided")
     assert {"field", "ratio", "guided", "linear", "nearest"} == set(second["methods"]) and second["truth"] == "own pose"
     assert {"psnr", "sam", "ergas", "ssim", "rmse"} <= set(first["methods"]["guided"])
-    table = run(fitted, "evaluate", "--convert", "rgb:mono")
+    table = here(fitted, "evaluate", "--convert", "rgb:mono")
     assert table.returncode == 0 and "ratio (auto)" in table.stdout
-    refused(run(fitted, "evaluate", "--convert", "rgb-ms"), "rgb-ms", "rgb:ms")
-    refused(run(fitted, "evaluate", "--convert", "rgb:thermal"), "thermal")
+    refused(here(fitted, "evaluate", "--convert", "rgb-ms"), "rgb-ms", "rgb:ms")
+    refused(here(fitted, "evaluate", "--convert", "rgb:thermal"), "thermal")
 
 
 def test_generate_dataset_resumes_and_verifies(fitted: Path) -> None:
@@ -126,12 +141,12 @@ def test_generate_dataset_resumes_and_verifies(fitted: Path) -> None:
     dataset = fitted / "runs/latest/dataset"
     before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*.npz")}
     assert len(json.loads((dataset / "dataset.json").read_text())["views"]) == 12 and before
-    assert run(fitted, "generate-dataset", "--poses", "poses.json", "--modalities", "rgb,pol").returncode == 0
+    assert here(fitted, "generate-dataset", "--poses", "poses.json", "--modalities", "rgb,pol").returncode == 0
     assert {p: p.stat().st_mtime_ns for p in dataset.rglob("*.npz")} == before
-    assert run(fitted, "generate-dataset", "--poses", "poses.json", "--verify").returncode == 0
+    assert here(fitted, "generate-dataset", "--poses", "poses.json", "--verify").returncode == 0
     victim = next(iter(before))
     victim.write_bytes(victim.read_bytes()[:-5])
-    refused(run(fitted, "generate-dataset", "--poses", "poses.json", "--verify"), "problem")
+    refused(here(fitted, "generate-dataset", "--poses", "poses.json", "--verify"), "problem")
 
 
 def test_generate_dataset_leaves_out_what_no_frame_saw(fitted: Path, tmp_path: Path) -> None:
@@ -142,15 +157,15 @@ def test_generate_dataset_leaves_out_what_no_frame_saw(fitted: Path, tmp_path: P
     content["frames"] = [*frames, {**frames[0], "file_path": "away.png", "transform_matrix": away}]
     (fitted / "three.json").write_text(json.dumps(content))
     args = ("generate-dataset", "--poses", "three.json", "--modalities", "rgb", "--out", str(tmp_path / "out"))
-    result = run(fitted, *args, "--min-coverage", "0.3")
+    result = here(fitted, *args, "--min-coverage", "0.3")
     assert result.returncode == 0, result.stderr
     lines = result.stdout.splitlines()
     assert lines[0].startswith("left out 1 of 3 views with a coverage below 0.3: away (0.") and lines[1].startswith("wrote 2 views")
     assert len(json.loads((tmp_path / "out/dataset.json").read_text())["views"]) == 2
-    facts = json.loads(run(fitted, *args, "--min-coverage", "0.3", "--json").stdout)
+    facts = json.loads(here(fitted, *args, "--min-coverage", "0.3", "--json").stdout)
     assert facts["views"] == 2 and facts["left_out"][0]["name"] == "away" and facts["left_out"][0]["coverage_score"] < 0.3
-    refused(run(fitted, *args, "--min-coverage", "30"), "--min-coverage 30", "from 0 to 1")
-    refused(run(fitted, *args, "--min-coverage", "1"), "the best of 3 views")
+    refused(here(fitted, *args, "--min-coverage", "30"), "--min-coverage 30", "from 0 to 1")
+    refused(here(fitted, *args, "--min-coverage", "1"), "the best of 3 views")
 
 
 def test_two_processes_make_the_dataset_of_one(fitted: Path, tmp_path: Path) -> None:
@@ -158,7 +173,7 @@ def test_two_processes_make_the_dataset_of_one(fitted: Path, tmp_path: Path) -> 
     (tmp_path / "nir.toml").write_text(MONO_TOML)
     few = ("--modalities", "mono,nir", "--outputs", "geometry,flow", "--sensor", str(tmp_path / "nir.toml"), "--seed", "3")
     command = ("generate-dataset", "--poses", str(tmp_path / "orbit.json"), *few)
-    assert run(fitted, *command, "--out", str(tmp_path / "one")).returncode == 0
+    assert here(fitted, *command, "--out", str(tmp_path / "one")).returncode == 0
     outputs = []
     for rank in ("1", "0"):
         result = run(fitted, *command, "--out", str(tmp_path / "two"), RANK=rank, WORLD_SIZE="2")
@@ -169,13 +184,13 @@ def test_two_processes_make_the_dataset_of_one(fitted: Path, tmp_path: Path) -> 
         {str(p.relative_to(tmp_path / n)): p.read_bytes() for p in (tmp_path / n).rglob("*.*") if p.is_file()} for n in ("one", "two")
     )
     assert one == two and {"dataset.json", "raw/meta_data.json", "views/0004/geometry.npz", "views/0003/flow.npz"} < set(one)
-    result = run(fitted, *command, "--out", str(tmp_path / "two"), "--verify", "--json")
+    result = here(fitted, *command, "--out", str(tmp_path / "two"), "--verify", "--json")
     assert json.loads(result.stdout)["problems"] == []
     raw = next(p for p in (tmp_path / "two/raw/modalities").rglob("*.png"))
     raw.write_bytes(raw.read_bytes()[:-3])
-    refused(run(fitted, *command, "--out", str(tmp_path / "two"), "--verify"), "1 problems", raw.name)
-    refused(run(fitted, *command, "--out", "no", "--raw"), "mono.toml")
-    refused(run(fitted, *command, "--out", "no", RANK="2", WORLD_SIZE="2"), "RANK")
+    refused(here(fitted, *command, "--out", str(tmp_path / "two"), "--verify"), "1 problems", raw.name)
+    refused(here(fitted, *command, "--out", "no", "--raw"), "mono.toml")
+    refused(here(fitted, *command, "--out", "no", RANK="2", WORLD_SIZE="2"), "RANK")
 
 
 def test_a_batch_goes_on_after_a_scene_that_fails(scene: Path, tmp_path: Path) -> None:
@@ -184,19 +199,19 @@ def test_a_batch_goes_on_after_a_scene_that_fails(scene: Path, tmp_path: Path) -
     (tmp_path / "list.txt").write_text("bad  # holds nothing\n\ngood\n")
     (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 2}))
     command = ("batch", "list.txt", "--steps", "12", "--modalities", "mono,nir", "--poses", "orbit.json", "--format", "webdataset")
-    result = run(tmp_path, *command)
+    result = here(tmp_path, *command)
     assert result.returncode == 2 and "1 of 2 scenes failed" in result.stderr and "bad" in result.stderr
     assert json.loads((tmp_path / "batch/bad/outcome.json").read_text())["error"].startswith("bad")
     name = scene.resolve().name
     outcome = json.loads((tmp_path / "batch" / name / "outcome.json").read_text())
     assert Path(tmp_path / outcome["dataset"]).is_file() and (tmp_path / outcome["run"] / "report.html").is_file()
     before = (tmp_path / outcome["run"] / "manifest.json").read_bytes()
-    again = run(tmp_path, *command, "--json")
+    again = here(tmp_path, *command, "--json")
     assert again.returncode == 2 and set(json.loads(again.stdout)["scenes"]) == {"bad", name}
     assert (tmp_path / outcome["run"] / "manifest.json").read_bytes() == before
-    refused(run(tmp_path, "batch", "nothing.txt"), "nothing.txt")
+    refused(here(tmp_path, "batch", "nothing.txt"), "nothing.txt")
     (tmp_path / "twice.txt").write_text("good\ngood\n")
-    refused(run(tmp_path, "batch", "twice.txt"), "twice.txt", name)
+    refused(here(tmp_path, "batch", "twice.txt"), "twice.txt", name)
 
 
 MONO_TOML = """name = "nir"
@@ -210,7 +225,7 @@ read_e = 5.0
 
 
 def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path, tmp_path: Path) -> None:
-    sensors = json.loads(run(fitted, "info", "example", "--json").stdout)["sensors"]
+    sensors = json.loads(here(fitted, "info", "example", "--json").stdout)["sensors"]
     name = next(n for n, s in sensors.items() if s["mosaic"] is None)
     (fitted / "own.toml").write_text(MONO_TOML.replace("nir", name))
     (fitted / "rgb.toml").write_text(MONO_TOML.replace("nir", "rgb"))
@@ -218,17 +233,17 @@ def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path, tmp_path: Pa
     assert result.returncode == 0, result.stderr
     out = Path(json.loads(result.stdout)["scene"])
     assert out == Path("runs/latest/simulated")
-    again = json.loads(run(fitted, "info", str(out), "--json").stdout)
+    again = json.loads(here(fitted, "info", str(out), "--json").stdout)
     assert set(again["sensors"]) == {name, "rgb"} and not again["problems"]
     assert all(again["sensors"][n]["frames"] == sensors[n]["frames"] for n in again["sensors"])
     assert again["sensors"]["rgb"]["bits"] == 12 and again["sensors"]["rgb"]["mosaic"] == sensors["rgb"]["mosaic"]
-    assert run(tmp_path, "fit", str(fitted / out), "--steps", "3").returncode == 0
+    assert here(tmp_path, "fit", str(fitted / out), "--steps", "3").returncode == 0
     # a trajectory, a packaged virtual camera, DNG
     (fitted / "orbit.json").write_text('{"trajectory": "orbit", "views": 3}')
     small = (data_folder("recipes") / "sensors" / "bayer_rgb.toml").read_text()
     small = small.replace("width = 1440", "width = 72").replace("height = 1080", "height = 54").replace("1739.1", "87.0")
     (fitted / "small.toml").write_text(small.replace("cx = 719.5", "cx = 35.5").replace("cy = 539.5", "cy = 26.5"))
-    result = run(fitted, "simulate", "--sensor", "small.toml", "--poses", "orbit.json", "--format", "dng", "--out", "dng", "--seed", "5")
+    result = here(fitted, "simulate", "--sensor", "small.toml", "--poses", "orbit.json", "--format", "dng", "--out", "dng", "--seed", "5")
     assert result.returncode == 0 and "wrote dng/" in result.stdout, result.stderr
     assert sorted(p.name for p in (fitted / "dng" / "modalities" / "bayer_rgb").iterdir()) == ["0000.dng", "0001.dng", "0002.dng"]
 
@@ -236,29 +251,29 @@ def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path, tmp_path: Pa
 def test_bad_simulations_are_refused(fitted: Path) -> None:
     (fitted / "psf.toml").write_text(MONO_TOML.replace("nir", "rgb").replace("[noise]", "psf_sigma_px = 1.0\n[noise]"))
     (fitted / "key.toml").write_text(MONO_TOML.replace("read_e", "read_noise"))
-    refused(run(fitted, "simulate", "--sensor", "psf.toml"), "one of --poses and --views")
-    refused(run(fitted, "simulate", "--sensor", "psf.toml", "--views", "test"), "psf.toml", "psf_sigma_px", "--delta")
-    refused(run(fitted, "simulate", "--sensor", "key.toml", "--views", "test"), "key.toml", "read_noise")
-    refused(run(fitted, "simulate", "--sensor", "nothing", "--views", "test"), "nothing", "bayer_rgb")
-    refused(run(fitted, "simulate", "--sensor", "rgb.toml", "--views", "test", "--rig", "aligned"), "--rig")
-    refused(run(fitted, "simulate", "--sensor", "rgb.toml", "--views", "777"), "777")
+    refused(here(fitted, "simulate", "--sensor", "psf.toml"), "one of --poses and --views")
+    refused(here(fitted, "simulate", "--sensor", "psf.toml", "--views", "test"), "psf.toml", "psf_sigma_px", "--delta")
+    refused(here(fitted, "simulate", "--sensor", "key.toml", "--views", "test"), "key.toml", "read_noise")
+    refused(here(fitted, "simulate", "--sensor", "nothing", "--views", "test"), "nothing", "bayer_rgb")
+    refused(here(fitted, "simulate", "--sensor", "rgb.toml", "--views", "test", "--rig", "aligned"), "--rig")
+    refused(here(fitted, "simulate", "--sensor", "rgb.toml", "--views", "777"), "777")
 
 
 def test_calibrate_noise(fitted: Path, tmp_path: Path) -> None:
-    assert run(tmp_path, "fit", "example", "--modalities", "nir", "--steps", "200").returncode == 0
-    result = run(tmp_path, "calibrate-noise", "--out", "sensors")
+    assert here(tmp_path, "fit", "example", "--modalities", "nir", "--steps", "200").returncode == 0
+    result = here(tmp_path, "calibrate-noise", "--out", "sensors")
     assert result.returncode == 0, result.stderr
     assert "gain [DN/e-]" in result.stdout and "wrote sensors/ (nir.toml, noise.svg)" in result.stdout
     assert {p.name for p in (tmp_path / "sensors").iterdir()} == {"nir.toml", "noise.svg", "noise.json"}
-    again = run(tmp_path, "simulate", "--sensor", "sensors/nir.toml", "--views", "test", "--json")
+    again = here(tmp_path, "simulate", "--sensor", "sensors/nir.toml", "--views", "test", "--json")
     assert again.returncode == 0, again.stderr
     # raw frames alone
     frames = sorted(str(p) for p in (data_folder("example_scene") / "modalities" / "infrared").iterdir())[:3]
-    alone = run(tmp_path, "calibrate-noise", "--sensor", "sensors/nir.toml", *frames, "--json")
+    alone = here(tmp_path, "calibrate-noise", "--sensor", "sensors/nir.toml", *frames, "--json")
     assert alone.returncode == 0 and json.loads(alone.stdout)["sensors"]["nir"]["frames"] == 3, alone.stderr
-    refused(run(tmp_path, "calibrate-noise", *frames), "expected one --sensor")
-    refused(run(tmp_path, "calibrate-noise", "--raw", "nowhere"), "nowhere", "no frames")
-    refused(run(fitted, "calibrate-noise", "--modalities", "rgb"), "rgb", "photon transfer")
+    refused(here(tmp_path, "calibrate-noise", *frames), "expected one --sensor")
+    refused(here(tmp_path, "calibrate-noise", "--raw", "nowhere"), "nowhere", "no frames")
+    refused(here(fitted, "calibrate-noise", "--modalities", "rgb"), "rgb", "photon transfer")
 
 
 def test_mesh(fitted: Path) -> None:
@@ -275,29 +290,29 @@ def test_mesh(fitted: Path) -> None:
     names = mesh.metadata["_ply_raw"]["vertex"]["data"].dtype.names
     assert {"rgb_0", "ms_8", "pol_dolp", "pol_axis_x", "nir_0", "quality", "views"} <= set(names)
     assert b"comment unit m\n" in (fitted / "runs/latest/mesh.ply").read_bytes()[:5000]
-    again = run(
+    again = here(
         fitted, "mesh", "--resolution", "48", "--geometry-only", "--out", "a.obj", "--against", "runs/latest/mesh.ply", "--faces", "600"
     )
     assert again.returncode == 0 and "wrote a.obj" in again.stdout and "F-score" in again.stdout, again.stderr
 
 
 def test_doctor(tmp_path: Path) -> None:
-    facts = json.loads(run(tmp_path, "doctor", "--json").stdout)
+    facts = json.loads(here(tmp_path, "doctor", "--json").stdout)
     assert facts["versions"]["torch"] and facts["cores"] >= 1
 
 
 def test_bad_scenes_are_refused_in_one_sentence(scene: Path, tmp_path: Path) -> None:
-    refused(run(tmp_path, "fit", "nowhere"), "nowhere")
+    refused(here(tmp_path, "fit", "nowhere"), "nowhere")
     meta = scene / "meta_data.json"
     good = meta.read_text()
 
     meta.write_text(good[:200])
-    refused(run(tmp_path, "fit", "scene"), "meta_data.json", "line")
+    refused(here(tmp_path, "fit", "scene"), "meta_data.json", "line")
 
     broken = json.loads(good)
     broken["modalities"]["rgb"]["frames"][3]["camtoworld"][1][2] = float("nan")
     meta.write_text(json.dumps(broken))
-    refused(run(tmp_path, "fit", "scene"), "meta_data.json", "rgb")
+    refused(here(tmp_path, "fit", "scene"), "meta_data.json", "rgb")
 
     far = json.loads(good)
     for modality in far["modalities"].values():
@@ -305,37 +320,37 @@ def test_bad_scenes_are_refused_in_one_sentence(scene: Path, tmp_path: Path) -> 
             for row in frame["camtoworld"]:
                 row[3] += 1000.0
     meta.write_text(json.dumps(far))
-    refused(run(tmp_path, "fit", "scene"), "region")
+    refused(here(tmp_path, "fit", "scene"), "region")
 
     meta.write_text(good)
-    refused(run(tmp_path, "fit", "scene", "--modalities", "rgb,thermal"), "thermal", "rgb")
-    refused(run(tmp_path, "fit", "scene", "--recipe", "nothing"), "nothing")
-    refused(run(tmp_path, "fit", "scene", "--budget", "soon"), "soon")
-    refused(run(tmp_path, "fit", "scene", "--resume"), "resume")
+    refused(here(tmp_path, "fit", "scene", "--modalities", "rgb,thermal"), "thermal", "rgb")
+    refused(here(tmp_path, "fit", "scene", "--recipe", "nothing"), "nothing")
+    refused(here(tmp_path, "fit", "scene", "--budget", "soon"), "soon")
+    refused(here(tmp_path, "fit", "scene", "--resume"), "resume")
 
     image = scene / "modalities" / "mono" / "0004.png"
     image.write_bytes(image.read_bytes()[:-100])
-    refused(run(tmp_path, "fit", "scene", "--steps", "5"), "0004.png")
+    refused(here(tmp_path, "fit", "scene", "--steps", "5"), "0004.png")
     assert not (tmp_path / "runs").exists()
 
 
 def test_commands_without_a_fit_are_refused(tmp_path: Path) -> None:
     for args in (("evaluate",), ("mesh",), ("convert", "--from", "rgb", "--to", "ms"), ("generate-dataset", "--poses", "poses.json")):
-        refused(run(tmp_path, *args), "fit")
+        refused(here(tmp_path, *args), "fit")
 
 
 def test_bad_requests_on_a_run_are_refused(fitted: Path) -> None:
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "thermal"), "thermal", "ms")
-    refused(run(fitted, "convert", "--from", "rgb", "--to", "ms", "--views", "777"), "777")
-    refused(run(fitted, "convert", "--from", "rgb,ms", "--to", "pol"), "rgb,ms")
-    refused(run(fitted, "generate-dataset", "--poses", "missing.json"), "missing.json")
-    refused(run(fitted, "mesh", "--out", "mesh.xyz", "--resolution", "16"), "mesh.xyz")
-    refused(run(fitted, "mesh", "--against", "gt.ply", "--resolution", "16"), "gt.ply")
-    refused(run(fitted, "mesh", "--keep", "some", "--resolution", "16"), "'some'", "largest")
-    refused(run(fitted, "mesh", "--distances", "near", "--resolution", "16"), "near", "0.001,0.002")
-    refused(run(fitted, "mesh", "--min-views", "99", "--geometry-only", "--resolution", "16"), "99", "training views")
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "thermal"), "thermal", "ms")
+    refused(here(fitted, "convert", "--from", "rgb", "--to", "ms", "--views", "777"), "777")
+    refused(here(fitted, "convert", "--from", "rgb,ms", "--to", "pol"), "rgb,ms")
+    refused(here(fitted, "generate-dataset", "--poses", "missing.json"), "missing.json")
+    refused(here(fitted, "mesh", "--out", "mesh.xyz", "--resolution", "16"), "mesh.xyz")
+    refused(here(fitted, "mesh", "--against", "gt.ply", "--resolution", "16"), "gt.ply")
+    refused(here(fitted, "mesh", "--keep", "some", "--resolution", "16"), "'some'", "largest")
+    refused(here(fitted, "mesh", "--distances", "near", "--resolution", "16"), "near", "0.001,0.002")
+    refused(here(fitted, "mesh", "--min-views", "99", "--geometry-only", "--resolution", "16"), "99", "training views")
     (fitted / "nan.json").write_text('{"convention": "OpenCV", "rig": [[[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]]}')
-    refused(run(fitted, "generate-dataset", "--poses", "nan.json"), "nan.json")
+    refused(here(fitted, "generate-dataset", "--poses", "nan.json"), "nan.json")
 
 
 def test_a_full_disk_leaves_nothing_half_written(fitted: Path, tmp_path: Path) -> None:
