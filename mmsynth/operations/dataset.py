@@ -105,6 +105,7 @@ def generate_dataset(
     for index in mine:
         goal += costs[index]
         if plan.finished(index) is None:
+            (plan.out / "dataset.json").unlink(missing_ok=True)  # it must not vouch for views of another request
             here = ahead.pop(index) if index in ahead else _render(plan, index, count)
             following = _following(plan, index, index + 1 in mine, ahead, count)
             _write_view(plan, index, here, following)

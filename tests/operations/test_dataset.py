@@ -197,6 +197,18 @@ def test_flow_coverage_and_what_was_asked_for(tmp_path: Path) -> None:
     assert counted.renders == 2
 
 
+def test_a_run_that_is_cut_off_has_no_summary_of_the_last_one(tmp_path: Path) -> None:
+    field: Any = AnalyticField(sphere())
+    generate_dataset(field, views_of(field, 2), tmp_path)
+    other: Any = AnalyticField(sphere(0.5))
+    other.render = lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        generate_dataset(other, views_of(field, 2), tmp_path)
+    assert not (tmp_path / "dataset.json").exists()
+    generate_dataset(field, views_of(field, 2), tmp_path)
+    assert verify(tmp_path) == []
+
+
 def test_verify_finds_damage(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     generate_dataset(field, views_of(field, 3), tmp_path)  # type: ignore[arg-type]
