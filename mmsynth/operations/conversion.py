@@ -28,14 +28,14 @@ from torch import Tensor
 from mmsynth.errors import InputError
 from mmsynth.operations.coverage import TrainingRays, coverage
 from mmsynth.operations.guidance import Guide, contrast, guide, linear_map
+from mmsynth.operations.visibility import SAME_SURFACE, surface_points
 from mmsynth.scene.scene import Sensor, canonical_modality
-from mmsynth.sensors.camera import Camera, project, ray_map
+from mmsynth.sensors.camera import Camera, project
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
 
 METHODS = ("auto", "field", "ratio", "guided")
-_SAME_SURFACE = 0.02  # of the distance: how far a point may lie behind what the source sees there
 _CARRIED = 0.6  # of a correction is right where it arrives through the surface: measured, on two scenes with ground truth
 _SURE = 0.1  # relative deviation at which confidence has fallen to exp(-1/2)
 
@@ -257,15 +257,12 @@ def _carried(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Layers (H, W, M) of the source's pixels → on the target's, through the surface; and where the source sees the same surface."""
     camera, pose = frame
-    directions = ray_map(seen_by[0])[0] @ seen_by[1][:3, :3].T
-    hit = there.valid & np.isfinite(there.depth_ray)
-    points = seen_by[1][:3, 3] + directions * np.where(hit, there.depth_ray, 1.0)[..., None]
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    local = (surface_points(*seen_by, there.depth_ray) - pose[:3, 3]) @ pose[:3, :3]
     pixels = project(local, camera)
-    inside = hit & np.isfinite(pixels).all(-1)
+    inside = np.isfinite(pixels).all(-1)  # NaN: no surface, or out of the lens
     at = np.where(inside[..., None], pixels, -10.0).astype(np.float32)
     sample = lambda image, how: cv2.remap(np.ascontiguousarray(image, np.float32), at[..., 0], at[..., 1], how, borderValue=0)
     depth = sample(np.where(np.isfinite(seen.depth_ray), seen.depth_ray, 0.0), cv2.INTER_NEAREST)
     distance = np.linalg.norm(local, axis=-1)
-    visible = inside & (np.abs(distance - depth) < _SAME_SURFACE * distance)
+    visible = inside & (np.abs(distance - depth) < SAME_SURFACE * distance)
     return np.dstack([sample(layers[..., i], cv2.INTER_LINEAR) for i in range(layers.shape[-1])]), visible

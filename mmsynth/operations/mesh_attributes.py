@@ -40,6 +40,7 @@ from mmsynth.errors import InputError
 from mmsynth.operations import previews
 from mmsynth.operations.coverage import resized
 from mmsynth.operations.progress import Counter, Progress, parts
+from mmsynth.operations.visibility import inside
 from mmsynth.sensors.camera import Camera, project
 from mmsynth.sensors.polarization import reference_axes
 
@@ -97,9 +98,8 @@ class View:
         out = np.zeros(len(points))
         rows = np.flatnonzero(cosine > _GRAZING)
         pixels = project(away[rows] @ self.pose[:3, :3], self.camera)
-        # NaN (no ray of the lens) is in no image
-        inside = ((pixels > -0.5) & (pixels < np.array([self.camera.width, self.camera.height]) - 0.5)).all(1)
-        rows, pixels = rows[inside], np.rint(pixels[inside]).astype(np.int64)
+        within = inside(pixels, self.camera)
+        rows, pixels = rows[within], np.rint(pixels[within]).astype(np.int64)
         met = self.depth_ray[pixels[:, 1], pixels[:, 0]]
         footprint = distance[rows] / min(self.camera.fx, self.camera.fy)
         rows = rows[np.abs(distance[rows] - met) <= footprint / cosine[rows] + _AGREES * distance[rows]]

@@ -34,6 +34,7 @@ from mmsynth.errors import InputError
 from mmsynth.operations.marching import Distance, checked
 from mmsynth.operations.mesh_attributes import View, small
 from mmsynth.operations.mesh_topology import components, topology
+from mmsynth.operations.visibility import inside
 from mmsynth.sensors.camera import Camera, project
 
 if TYPE_CHECKING:
@@ -136,9 +137,9 @@ def compare(
     at = [share * radius for share in _SHARES] if distances is None else list(distances)
     ours, true = _Samples(mesh, samples, 0), _Samples(reference, samples, 1)
     to_ours, to_true = _Triangles(ours), _Triangles(true)
-    inside = 1.0
+    share = 1.0
     if region is not None:
-        inside = float((np.linalg.norm(true.points - np.array(region.centre), axis=1) <= region.radius).mean())
+        share = float((np.linalg.norm(true.points - np.array(region.centre), axis=1) <= region.radius).mean())
         for drawn in (ours, true):
             drawn.keep(np.linalg.norm(drawn.points - np.array(region.centre), axis=1) <= region.radius)
     if views:
@@ -167,7 +168,7 @@ def compare(
         "f_score": scores,
         "normal_consistency": 0.5 * float(cosine_there.mean() + cosine_back.mean()),
         "points": [len(there), len(back)],
-        "reference_in_region": inside,
+        "reference_in_region": share,
         "views": len(views),
     }
 
@@ -205,10 +206,10 @@ def _depth_maps(mesh: trimesh.Trimesh, cameras: Sequence[tuple[Camera, np.ndarra
     for camera, pose in cameras:
         away = points - pose[:3, 3]
         pixels = project(away @ pose[:3, :3], camera)
-        inside = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(1)  # NaN is in no image
-        column, row = np.rint(pixels[inside]).astype(np.int64).T
+        within = inside(pixels, camera)
+        column, row = np.rint(pixels[within]).astype(np.int64).T
         depth = np.full((camera.height, camera.width), np.inf)
-        np.minimum.at(depth, (row, column), np.linalg.norm(away[inside], axis=1))
+        np.minimum.at(depth, (row, column), np.linalg.norm(away[within], axis=1))
         out.append(View(camera, pose, np.where(np.isfinite(depth), depth, np.nan)))
     return out
 
