@@ -496,7 +496,7 @@ def calibrate_noise(
     sensor: Annotated[
         list[str] | None, typer.Option(help="sensor files that say bits, black level and alignment; default: what the frames use")
     ] = None,
-    raw: Annotated[Path | None, typer.Option(help="other frames at the same poses, RAW/MODALITY/0009.png")] = None,
+    raw: Annotated[Path | None, typer.Option(help="other frames at the same poses, of any exposure: RAW/MODALITY/0009.png")] = None,
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: those of the training")] = None,
     out: Annotated[Path | None, typer.Option(help="default: RUN/sensors, or sensors")] = None,
     as_json: JsonOption = False,

@@ -33,22 +33,28 @@ if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
 _RAYS = 4_000_000  # to render for each sensor
+_LEAST_LIT = 16  # pixels, to measure an exposure
 _BLUR = 1.5  # of a frame that is its own expectation, in tiles of the mosaic
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibrated:
-    """A sensor file with the figures found, the figures with their deviations, and how many frames they are from."""
+    """A sensor file with the figures found, the figures with their deviations, and what they are from.
+
+    Attributes:
+        frames: how many. exposure: of each, in units of what the field learned; frames alone have none.
+    """
 
     file: SensorFile
     found: PhotonTransfer
     frames: int
+    exposure: tuple[float, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         p, noise = self.found, self.file.noise
         share = p.gain_sd / p.gain_dn_e
         return {
-            "frames": self.frames, "bits": noise.bits, "black_dn": noise.black_dn,
+            "frames": self.frames, "exposure": list(self.exposure), "bits": noise.bits, "black_dn": noise.black_dn,
             "gain_dn_e": p.gain_dn_e, "gain_sd": p.gain_sd,
             "full_scale_e": noise.electrons_at_one, "full_scale_sd": noise.electrons_at_one * share,
             "read_e": p.read_e, "read_sd": p.read_sd, "prnu": p.prnu, "prnu_sd": p.prnu_sd,
@@ -79,9 +85,12 @@ def calibrate_noise(
 ) -> tuple[dict[str, Calibrated], dict[str, str]]:
     """Noise figures of the sensors of a scene, from its frames and the field.
 
+    Each frame has an exposure of its own, which is measured against the field. Short ones tell the read noise.
+
     Args:
         modalities: None: all. known: sensor files by modality, whose bits, black level and alignment are believed; without, bits are
-            those that the frames use, and black is 0. raw: a folder with other frames of the same poses, ``raw/MODALITY/0009.png``.
+            those that the frames use, and black is 0. raw: a folder with other frames of the same poses, of any exposure,
+            ``raw/MODALITY/0009.png``.
         views: of which frames; None: the training views, or all that ``raw`` has. progress: called with (rays done, rays in all).
     Returns:
         the figures by modality; and, of modalities whose frames tell nothing (see ``photon_transfer_of_frames``), a sentence that says why.
@@ -177,12 +186,34 @@ def _tile(pattern: np.ndarray | None) -> np.ndarray:
 
 
 def _calibrated(sensor: Sensor, file: SensorFile, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Calibrated:
+    """From raw frames and what the field says of them [DN]."""
+    pattern = _tile(sensor.mosaic)
     if pairs[0][0].ndim == 3:  # every channel at every pixel: each is a frame of its own, of one converter
         split = [(raw[..., c], expected[..., c : c + 1]) for raw, expected in pairs for c in range(raw.shape[-1])]
-        found = _fit(sensor.name, file, split, _tile(None))
+        pattern = _tile(None)
     else:
-        found = _fit(sensor.name, file, pairs, _tile(sensor.mosaic))
-    return Calibrated(_with(file, found), found, len(pairs))
+        split = list(pairs)
+    black, white = file.noise.black_dn, file.noise.white_dn
+    exposure = [_exposure(raw, expected, pattern, black, white) for raw, expected in split]
+    exposed = [(raw, black + e * (expected - black)) for (raw, expected), e in zip(split, exposure, strict=True)]
+    found = _fit(sensor.name, file, exposed, pattern)
+    return Calibrated(_with(file, found), found, len(pairs), tuple(np.reshape(exposure, (len(pairs), -1)).mean(1).tolist()))
+
+
+def _exposure(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, black: float, white: float) -> float:
+    """Of a frame (H, W), in units of the expectation's (H, W, C): light of the brighter half in all, less what nobody expected."""
+    light = np.take_along_axis(expected, channel_map(pattern, *raw.shape)[..., None], -1)[..., 0] - black
+    good = np.isfinite(light) & (raw < 0.98 * white)
+    good &= light > max(float(np.median(light[good])), 0.0) if good.any() else False
+    if good.sum() < _LEAST_LIT:
+        return 1.0
+    seen, light = raw[good] - black, light[good]
+    exposure = float(seen.sum() / light.sum())
+    for _ in range(3):
+        off = np.abs(seen - exposure * light)
+        near = off <= 4.0 * np.median(off)
+        exposure = float(seen[near].sum() / light[near].sum())
+    return max(exposure, 1e-6)
 
 
 def _fit(name: str, file: SensorFile, pairs: Sequence[tuple[np.ndarray, np.ndarray]], pattern: np.ndarray) -> PhotonTransfer:

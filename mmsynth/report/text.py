@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -54,8 +55,11 @@ def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
 
 def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
     """The result of ``calibrate-noise``: one row per sensor, with standard deviations; "<": not told, and what would have been seen;
-    "–": one frame alone tells no pattern."""
-    lines = [f"{'sensor':14s}{'frames':>7s}{'bits':>5s}{'gain [DN/e-]':>22s}{'full scale [e-]':>20s}{'read [e-]':>14s}{'PRNU [%]':>14s}"]
+    "–": one frame alone tells no pattern. Exposure: the frames' median, in units of what the field learned."""
+    lines = [
+        f"{'sensor':14s}{'frames':>7s}{'exposure':>9s}{'bits':>5s}{'gain [DN/e-]':>20s}{'full scale [e-]':>18s}{'read [e-]':>14s}"
+        f"{'PRNU [%]':>14s}"
+    ]
 
     def pair(value: float, sd: float, digits: int) -> str:
         return f"{value:.{digits}f} ± {sd:.{digits}f}" if value > 0 else "–" if sd >= 100.0 else f"< {sd:.{digits}f}"
@@ -63,9 +67,10 @@ def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
     for name, c in calibrated.items():
         p, noise = c.found, c.file.noise
         full = noise.electrons_at_one
+        exposure = f"{statistics.median(c.exposure):.3g}" if c.exposure else "–"
         lines.append(
-            f"{name:14s}{c.frames:7d}{noise.bits:5d}{f'{p.gain_dn_e:.4g} ± {p.gain_sd:.2g}':>22s}"
-            f"{pair(full, full * p.gain_sd / p.gain_dn_e, 0):>20s}{pair(p.read_e, p.read_sd, 1):>14s}"
+            f"{name:14s}{c.frames:7d}{exposure:>9s}{noise.bits:5d}{f'{p.gain_dn_e:.4g} ± {p.gain_sd:.2g}':>20s}"
+            f"{pair(full, full * p.gain_sd / p.gain_dn_e, 0):>18s}{pair(p.read_e, p.read_sd, 1):>14s}"
             f"{pair(100 * p.prnu, 100 * p.prnu_sd, 2):>14s}"
         )
     return "\n".join(lines)

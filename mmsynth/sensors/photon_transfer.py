@@ -29,8 +29,10 @@ Wide = tuple[float, float]
 """Variance of what was not expected: in units of what was, and [DN²]."""
 
 _TEXTURE: Wide = (16.0, 0.0)
-_ACTIVITY = 30.0  # expected square differences up to this many variances count: flatter ones are few where it is bright
+_ACTIVITY = (1.25, 2.5, 5.0, 10.0, 30.0)  # expected square differences, in variances, up to which a surface counts, the plainest first
 _PLAIN, _LEAST_PLAIN = 10.0, 1000  # there must be as many whose expected square difference is below as many variances
+_TEXTURE_OFF = 0.025  # of the gain, times 1 for the plainest surfaces, 2 for the next, ..: as measured on fitted scenes with a truth
+_SEEN = 3.0  # deviations of its square from which a PRNU is one: with fewer, one of forty fits takes chance for it
 _MOST = 400_000  # values of a fit
 _LEAST = 200
 _WINDOW, _BLOCK = 3, 32
@@ -118,7 +120,7 @@ def photon_transfer(raw: np.ndarray, expected: np.ndarray, bits: int, black_dn: 
         theta = _most_likely(theta, chosen, 1, free, wide)
     covariance = _sandwich(theta, chosen, 1, free, wide)
     square, spread = float(np.exp(theta[_SQUARE])), float(np.exp(theta[_SQUARE]) * covariance[_SQUARE, _SQUARE] ** 0.5)
-    if square > 2.0 * spread:
+    if square > _SEEN * spread:
         return _result(theta, covariance, chosen, 1, black_dn, square**0.5, 0.5 * spread / square**0.5)
     # no use for it: the others are told better without
     theta[_SQUARE] = -np.inf
@@ -133,12 +135,16 @@ def photon_transfer_of_frames(
     """Noise figures from raw frames and a model's renderings of them.
 
     The values are second differences a - 2 b + c of photosites one tile of the mosaic apart, along rows and columns. PRNU is what
-    differences at one place have in common in several frames, E[d_i d_j] = 6 PRNU² μ_i μ_j, where that is more than twice its deviation.
-    Standard deviations are by blocks of 32 x 32 photosites (sandwich estimator): differences share photosites, and what is wrong in one
-    place is wrong around it; to which comes what plainer surfaces say differently. Fine texture that the model does not see still counts
-    as noise: where all that is bright has it, the gain is too large, by up to a sixth, and the read noise too small, by up to two fifths,
-    and the deviations do not tell. Frames that were rendered from another field have such grain everywhere: gains 1.2 to 1.8
-    times too large.
+    differences at one place have in common in several frames, E[d_i d_j] = 6 PRNU² μ_i μ_j, where that is more than three times its
+    deviation.
+
+    Texture that the model does not see counts as noise, the more the less plain a surface is, and plain ones are few: of surfaces plain
+    to five degrees those are taken whose gain deviates least, all told. That is by blocks of 32 x 32 photosites (sandwich estimator:
+    differences share photosites, and what is wrong in one place is wrong around it), by what the next less plain surfaces say
+    differently, and 2.5 % for each degree. Texture as fine as photosites still leads off: where all that is bright has it, the gain is
+    too large, by up to a sixth, and the read noise too small, by up to two fifths, and the deviations do not tell. Frames that were
+    rendered from another field have such grain everywhere: gains 1.1 to 2 times too large. The read noise is told where it is a good
+    part of the noise: by frames of short exposure.
 
     Args:
         frames: raw (H, W) and expected (H, W, C), all channels at every pixel, DN, black level included; NaN where unknown.
@@ -160,22 +166,35 @@ def photon_transfer_of_frames(
     for _ in range(3):
         # noise of pixels near black is cut off there
         variance = _variance_of(theta, joined.mean)
-        plain = joined[(joined.activity < _ACTIVITY * variance) & (joined.mean + black_dn > 3.0 * np.sqrt(variance))]
-        _check(plain)
-        plain = _without_foreseen(theta, plain)
+        usable = joined[(joined.activity < _ACTIVITY[-1] * variance) & (joined.mean + black_dn > 3.0 * np.sqrt(variance))]
+        _check(usable)
+        plain = _without_foreseen(theta, usable)
         prnu, prnu_sd = _response_pattern(plain, _variance_of(theta, plain.mean))
         theta[_SQUARE] = 2.0 * np.log(prnu) if prnu > 0 else -np.inf
-        chosen = _drawn(plain, seed)
-        theta = _most_likely(theta, chosen, 6, free)
-    plainer = chosen[chosen.activity < _PLAIN * _variance_of(theta, chosen.mean)]
-    if len(plainer.value) < _LEAST_PLAIN:
+        theta = _most_likely(theta, _drawn(plain, seed), 6, free)
+    flatness = usable.activity / _variance_of(theta, usable.mean)
+    if (count := int((flatness < _PLAIN).sum())) < _LEAST_PLAIN:
         raise InputError(
-            f"photon transfer: {len(plainer.value)} differences on plain surfaces, expected at least {_LEAST_PLAIN}; what these frames "
-            "show is textured everywhere, give others."
+            f"photon transfer: {count} differences on plain surfaces, expected at least {_LEAST_PLAIN}; what these frames show is "
+            "textured everywhere, give others."
         )
-    # how far it hangs on texture is what plainer surfaces say differently
-    result = _result(theta, _sandwich(theta, chosen, 6, free), chosen, 6, black_dn, prnu, prnu_sd)
-    return _and_off(result, _most_likely(theta, plainer, 6, free))
+    fits = []
+    for most in _ACTIVITY:
+        chosen = usable[flatness < most]
+        if len(chosen.value) >= _LEAST_PLAIN:
+            chosen = _drawn(_without_foreseen(theta, chosen), seed)
+            estimate = _most_likely(theta, chosen, 6, free)
+            fits.append((estimate, _sandwich(estimate, chosen, 6, free), chosen))
+    # how far it hangs on texture is what the next less plain surfaces say differently
+    others = [fits[i + 1 if i + 1 < len(fits) else i - 1][0] for i in range(len(fits))]
+    deviations = [
+        math.hypot(covariance[_SLOPE, _SLOPE] ** 0.5, estimate[_SLOPE] - other[_SLOPE], _TEXTURE_OFF * (step + 1))
+        if _grows(estimate)
+        else math.inf
+        for step, ((estimate, covariance, _), other) in enumerate(zip(fits, others, strict=True))
+    ]
+    best = int(np.argmin(deviations))
+    return _and_off(_result(*fits[best], 6, black_dn, prnu, prnu_sd), deviations[best], others[best])
 
 
 def _differences(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, white: float, black: float, frame: int) -> _Values:
@@ -330,7 +349,7 @@ def _response_pattern(d: _Values, variance: np.ndarray) -> tuple[float, float]:
         return 0.0, 1.0
     square = float(products.sum() / weights.sum())
     spread = float(np.sqrt(((products - square * weights) ** 2).sum()) / weights.sum())
-    if square < 2.0 * spread:
+    if square < _SEEN * spread:
         return 0.0, float(np.sqrt(2.0 * spread))
     return float(np.sqrt(square)), float(0.5 * spread / np.sqrt(square))
 
@@ -342,7 +361,7 @@ def _result(
     theta: np.ndarray, covariance: np.ndarray, d: _Values, factor: int, black_dn: float, prnu: float, prnu_sd: float
 ) -> PhotonTransfer:
     constant, gain = np.exp(theta[:2])
-    if not gain > 1e-5:
+    if not _grows(theta):
         raise InputError("photon transfer: the variance does not grow with light, expected shot noise.")
     # of the square of the read noise in DN, by its information where it is 0, where the logarithm has no bound
     spread = max(float(constant * covariance[_CONSTANT, _CONSTANT] ** 0.5), _spread_at_zero(theta, d, factor))
@@ -361,11 +380,16 @@ def _result(
     )
 
 
-def _and_off(found: PhotonTransfer, other: np.ndarray) -> PhotonTransfer:
-    """The same figures, deviating by what another estimate says, too."""
-    gain, read = float(np.exp(other[_SLOPE])), float(np.exp(0.5 * other[_CONSTANT] - other[_SLOPE]))
+def _grows(theta: np.ndarray) -> bool:
+    """Whether there is shot noise."""
+    return bool(np.exp(theta[_SLOPE]) > 1e-5)
+
+
+def _and_off(found: PhotonTransfer, share: float, other: np.ndarray) -> PhotonTransfer:
+    """The same figures; the gain is known to a share of it, and the read noise deviates by what another estimate says, too."""
+    read = float(np.exp(0.5 * other[_CONSTANT] - other[_SLOPE]))
     read_sd = math.hypot(found.read_sd, found.read_e - read) if found.read_e > 0 else max(found.read_sd, read)
-    return replace(found, gain_sd=math.hypot(found.gain_sd, found.gain_dn_e - gain), read_sd=read_sd)
+    return replace(found, gain_sd=found.gain_dn_e * share, read_sd=read_sd)
 
 
 def _spread_at_zero(theta: np.ndarray, d: _Values, factor: int) -> float:

@@ -41,10 +41,17 @@ def test_more_rays_are_closer_to_the_mean_over_the_pixel(rows: list[dict[str, An
     assert errors == sorted(errors, reverse=True) and errors[0] > 3 * errors[3]
 
 
-def test_calibration_gets_better_with_frames(rows: list[dict[str, Any]]) -> None:
-    truth = _of(rows, "calibration", "truth")
-    assert truth[-1]["gain"] < 0.01 < truth[0]["gain"] and truth[-1]["prnu"] < 0.05
-    assert _of(rows, "calibration", "model")[-1]["gain"] < 0.25
+def test_calibration_gets_better_with_frames_and_with_short_exposures(rows: list[dict[str, Any]]) -> None:
+    """And the read noise, given the truth, is as far off as it must be."""
+    one, four, quarter, sixteenth = _of(rows, "calibration", "truth")
+    assert four["gain"] < 0.01 < one["gain"] and four["prnu"] < 0.05
+    assert (
+        one["read_at_best"] > 2.0 * four["read_at_best"] > 4.0 * quarter["read_at_best"] > 4.0 * sixteenth["read_at_best"]
+        and sixteenth["read"] < 0.05
+    )
+    assert all(row["read"] < 4.0 * row["read_at_best"] for row in (one, four, quarter, sixteenth))
+    *_, of_model = _of(rows, "calibration", "model")
+    assert of_model["gain"] < 0.1 and of_model["read"] < 0.25
 
 
 def test_errors_of_virtual_channels_are_foretold(rows: list[dict[str, Any]]) -> None:

@@ -121,6 +121,23 @@ def test_other_frames_of_the_same_poses(made: Path, tmp_path: Path) -> None:
         calibrate_noise(field, scene, ["mono"], known, tmp_path)
 
 
+def test_frames_of_a_short_exposure_tell_the_read_noise(made: Path, tmp_path: Path) -> None:
+    """At the full exposure read noise is 2 to 30 % of the variance and a rough field's own texture as much; at a sixteenth most of it."""
+    exact, field = AnalyticField(sphere()), WithBlack(sphere())
+    scene = load_scene(made / "scene")
+    known = by_modality([load_sensor(made / "mono.toml")])
+    for frame in scene.frames_of("mono"):
+        light = torch.from_numpy(exact.render(frame.camera, exact.pose_of(frame), ["mono"]).channels["mono"][..., 0].astype(np.float64))
+        exposure = (1 / 16 if frame.view % 2 else 1 / 12) * known["mono"].dn_at_one / (4095 - 64)  # 1 is 4095.94 DN to a field
+        raw = record(exposure * light[None], TRUE, [frame.view], "short")[0].numpy()
+        (tmp_path / "mono").mkdir(exist_ok=True)
+        write_png(tmp_path / "mono" / f"{frame.view:04d}.png", raw.astype(np.uint16) << 4)
+    (c,) = calibrate_noise(field, scene, ["mono"], known, tmp_path)[0].values()  # type: ignore[arg-type]
+    assert c.exposure == pytest.approx([1 / 12, 1 / 16] * 3, rel=0.01)
+    assert c.found.read_e == pytest.approx(6.0, rel=0.1) and abs(c.found.read_e - 6.0) < 4 * c.found.read_sd < 4
+    assert c.found.gain_dn_e == pytest.approx(0.4, rel=0.1)
+
+
 def test_from_frames_alone(tmp_path: Path) -> None:
     """A smooth picture of a 2 x 2 mosaic, 14 bits that are not moved up."""
     v, u = np.mgrid[:200, :260]

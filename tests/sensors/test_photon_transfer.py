@@ -181,7 +181,7 @@ def test_texture_that_the_model_does_not_see_leads_off_no_farther_than_is_said(s
 @pytest.mark.parametrize("pattern", [NONE, RGGB, MULTISPECTRAL], ids=["1x1", "2x2", "3x3"])
 def test_deviations_cover_on_plain_scenes(pattern: np.ndarray) -> None:
     for seed in (0, 1):
-        found = photon_transfer_of_frames(_frames(_model(), 1, seed, "nowhere", pattern, rough=False), pattern, 12, 64.0)
+        found = photon_transfer_of_frames(_frames(_model(), 2, seed, "nowhere", pattern, rough=False), pattern, 12, 64.0)
         _require_within_deviations(found, _model())
         assert 0 < found.gain_sd < 0.02 and 0 < found.read_sd < 5.0
 
