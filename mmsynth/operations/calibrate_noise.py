@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 _RAYS = 4_000_000  # to render for each sensor
 _LEAST_LIT = 16  # pixels, to measure an exposure
+_EXPLAINED = 0.75  # of a frame's variance, from which a field knows what it shows: one that was fitted explains 0.95 and more
 _BLUR = 1.5  # of a frame that is its own expectation, in tiles of the mosaic
 
 
@@ -93,7 +94,8 @@ def calibrate_noise(
             ``raw/MODALITY/0009.png``.
         views: of which frames; None: the training views, or all that ``raw`` has. progress: called with (rays done, rays in all).
     Returns:
-        the figures by modality; and, of modalities whose frames tell nothing (see ``photon_transfer_of_frames``), a sentence that says why.
+        the figures by modality; and, of modalities whose frames tell nothing (see ``photon_transfer_of_frames``) or whose frames the
+        field does not explain, a sentence that says why.
     Raises:
         InputError: unknown modality, or no frames of one.
     """
@@ -193,27 +195,35 @@ def _calibrated(sensor: Sensor, file: SensorFile, pairs: Sequence[tuple[np.ndarr
         pattern = _tile(None)
     else:
         split = list(pairs)
-    black, white = file.noise.black_dn, file.noise.white_dn
-    exposure = [_exposure(raw, expected, pattern, black, white) for raw, expected in split]
-    exposed = [(raw, black + e * (expected - black)) for (raw, expected), e in zip(split, exposure, strict=True)]
-    found = _fit(sensor.name, file, exposed, pattern)
-    return Calibrated(_with(file, found), found, len(pairs), tuple(np.reshape(exposure, (len(pairs), -1)).mean(1).tolist()))
+    found = [_exposed(raw, expected, pattern, file.noise.black_dn, file.noise.white_dn) for raw, expected in split]
+    explained = float(np.median([e for _, e, _ in found]))
+    if explained < _EXPLAINED:
+        raise InputError(
+            f"{sensor.name}: the field explains {max(explained, 0.0):.0%} of what these frames show, expected at least {_EXPLAINED:.0%}; "
+            "fit it longer, or give frames of a longer exposure."
+        )
+    told = _fit(sensor.name, file, [(raw, expected) for (raw, _), (_, _, expected) in zip(split, found, strict=True)], pattern)
+    exposure = np.reshape([e for e, _, _ in found], (len(pairs), -1)).mean(1)
+    return Calibrated(_with(file, told), told, len(pairs), tuple(exposure.tolist()))
 
 
-def _exposure(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, black: float, white: float) -> float:
-    """Of a frame (H, W), in units of the expectation's (H, W, C): light of the brighter half in all, less what nobody expected."""
-    light = np.take_along_axis(expected, channel_map(pattern, *raw.shape)[..., None], -1)[..., 0] - black
-    good = np.isfinite(light) & (raw < 0.98 * white)
-    good &= light > max(float(np.median(light[good])), 0.0) if good.any() else False
-    if good.sum() < _LEAST_LIT:
-        return 1.0
-    seen, light = raw[good] - black, light[good]
-    exposure = float(seen.sum() / light.sum())
-    for _ in range(3):
+def _exposed(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, black: float, white: float) -> tuple[float, float, np.ndarray]:
+    """Exposure of a frame (H, W) in units of the expectation's (H, W, C); the share of its variance that this explains; the expectation at
+    that exposure. The exposure is the light of the brighter half in all, less what nobody expected.
+    """
+    everywhere = np.take_along_axis(expected, channel_map(pattern, *raw.shape)[..., None], -1)[..., 0] - black
+    good = np.isfinite(everywhere) & (raw < 0.98 * white)
+    light, seen = everywhere[good], raw[good] - black
+    bright = light > max(float(np.median(light)), 0.0) if len(light) else good[good]
+    if bright.sum() < _LEAST_LIT:
+        return 1.0, 1.0, expected
+    near = bright
+    for _ in range(4):
+        exposure = max(float(seen[near].sum() / light[near].sum()), 1e-6)
         off = np.abs(seen - exposure * light)
-        near = off <= 4.0 * np.median(off)
-        exposure = float(seen[near].sum() / light[near].sum())
-    return max(exposure, 1e-6)
+        near = bright & (off <= 4.0 * np.median(off[bright]))
+    explained = 1.0 - float(np.mean((seen - exposure * light) ** 2) / max(float(seen.var()), 1e-12))
+    return exposure, explained, black + exposure * (expected - black)
 
 
 def _fit(name: str, file: SensorFile, pairs: Sequence[tuple[np.ndarray, np.ndarray]], pattern: np.ndarray) -> PhotonTransfer:
