@@ -53,7 +53,7 @@ def write_mesh(mesh: trimesh.Trimesh, path: Path, unit: str | None = None) -> No
     plain: Any
     note = f"mmsynth, unit: {unit}, frame: {FRAME}"
     if suffix == ".ply":
-        data = _ply(mesh, [note, f"unit {unit}", f"frame {FRAME}"])
+        data = _ply(mesh, ["mmsynth", f"unit {unit}", f"frame {FRAME}"])
     elif suffix == ".glb":
         data = _glb(mesh, unit)
     elif suffix == ".stl":

@@ -49,8 +49,8 @@ _START = np.array([np.log(4.0), 0.0, -12.0, np.log(0.3), -3.0])
 class PhotonTransfer:
     """What the variance of raw values tells of a sensor; each figure with its standard deviation.
 
-    A read noise or PRNU that is not told (no dark pixels, no pattern) is 0, and its deviation is what would have been seen at twice the
-    deviation of its square.
+    A read noise or PRNU that is not told (no dark pixels, no pattern) is 0, and its deviation is what would have been seen at twice, for
+    PRNU thrice, the deviation of its square.
 
     Attributes:
         gain_dn_e: K [DN / e-]. read_e: σ_d [e-], of all that does not depend on light. prnu: share. mean_dn, variance_dn2: the curve
@@ -126,7 +126,7 @@ def photon_transfer(raw: np.ndarray, expected: np.ndarray, bits: int, black_dn: 
     theta[_SQUARE] = -np.inf
     theta = _most_likely(theta, chosen, 1, (_CONSTANT, _SLOPE, _UNEXPECTED), wide)
     covariance = _sandwich(theta, chosen, 1, (_CONSTANT, _SLOPE, _UNEXPECTED), wide)
-    return _result(theta, covariance, chosen, 1, black_dn, 0.0, float(np.sqrt(2.0 * spread)))
+    return _result(theta, covariance, chosen, 1, black_dn, 0.0, float(np.sqrt(_SEEN * spread)))
 
 
 def photon_transfer_of_frames(
@@ -350,7 +350,7 @@ def _response_pattern(d: _Values, variance: np.ndarray) -> tuple[float, float]:
     square = float(products.sum() / weights.sum())
     spread = float(np.sqrt(((products - square * weights) ** 2).sum()) / weights.sum())
     if square < _SEEN * spread:
-        return 0.0, float(np.sqrt(2.0 * spread))
+        return 0.0, float(np.sqrt(_SEEN * spread))
     return float(np.sqrt(square)), float(0.5 * spread / np.sqrt(square))
 
 

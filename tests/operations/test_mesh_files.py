@@ -136,7 +136,7 @@ def test_geometry_comes_back(tmp_path: Path, suffix: str) -> None:
     assert np.allclose(back.bounds, mesh.bounds, atol=1e-6)
     assert back.volume == pytest.approx(mesh.volume, rel=1e-5)  # the same way round
     if suffix != ".glb":
-        assert b"unit: m" in (tmp_path / f"mesh{suffix.upper()}").read_bytes()[:300]
+        assert b"unit m" in (tmp_path / f"mesh{suffix.upper()}").read_bytes()[:300].replace(b":", b"")
 
 
 def test_far_from_the_origin_positions_are_double(tmp_path: Path) -> None:
