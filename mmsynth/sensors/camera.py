@@ -87,7 +87,7 @@ def project_points(points: Tensor, intrinsics: Tensor, coefficients: Tensor, len
     x, y, z = points.unbind(-1)
     if lens == "kannala_brandt":
         across = x * x + y * y
-        far = across > (_ON_AXIS * z) ** 2  # from the axis, also where z < 0
+        far = (across > (_ON_AXIS * z) ** 2) | ((z < 0) & (across > 0))  # from the axis ahead: what is behind has its angle alone
         radius = torch.sqrt(torch.where(far, across, 1.0))
         angle = torch.atan2(torch.where(far, radius, 0.0), torch.where(far, z, 1.0))
         ahead = torch.where((z > 0) & ~far, z, 1.0)

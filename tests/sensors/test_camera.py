@@ -7,7 +7,7 @@ import kornia
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mmsynth.errors import InputError
@@ -129,6 +129,7 @@ def test_tangential_terms_fold_a_lens_too() -> None:
 @given(
     k1=st.floats(-0.1, 0.1), k2=st.floats(-0.05, 0.05), k3=st.floats(-0.01, 0.01), k4=st.floats(-0.002, 0.002), focal=st.floats(10, 60)
 )  # fmt: skip
+@example(k1=0.0078125, k2=0.0, k3=0.0, k4=0.0, focal=10.0)  # a pixel whose ray is 36 µrad from straight back
 def test_fisheyes_come_back_from_up_to_beyond_the_side(k1: float, k2: float, k3: float, k4: float, focal: float) -> None:
     camera = Camera(81, 61, focal, focal, 40.0, 30.0, (k1, k2, k3, k4), "kannala_brandt")
     directions, valid = ray_map(camera)
