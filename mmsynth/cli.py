@@ -122,6 +122,14 @@ def _seconds(text: str, option: str = "--budget") -> float:
     return float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2] or "s"]
 
 
+def _length(steps: int | None, budget: str | None, default: str | None = None) -> float | None:
+    """Seconds of a fit whose length is not given in steps."""
+    if steps is not None and budget is not None:
+        raise InputError("--steps and --budget: give one of the two.")
+    text = budget or default
+    return _seconds(text) if text and steps is None else None
+
+
 def _scene_path(text: str) -> Path:
     from mmsynth.data import data_folder
 
@@ -201,9 +209,7 @@ def fit(
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
 
-    if steps is not None and budget is not None:
-        raise InputError("--steps and --budget: give one of the two.")
-    seconds = _seconds(budget) if budget else None
+    seconds = _length(steps, budget)
     loaded = keep_frames(load_scene(_scene_path(scene), _names(modalities)), _frames(frames))
     name = loaded.root.resolve().name
     folder = run or (run_to_resume(name) if resume else new_run(name))
@@ -424,11 +430,9 @@ def batch(
     from mmsynth.operations.batch import Job, read_scene_list, run_batch
     from mmsynth.operations.share import share_of_environment
 
-    if steps is not None and budget is not None:
-        raise InputError("--steps and --budget: give one of the two.")
+    seconds = _length(steps, budget)
     listed, share = read_scene_list(scenes), share_of_environment()
     names = _names(modalities)
-    seconds = _seconds(budget) if budget else None
     job = Job(
         load_recipe(recipe), steps, seconds, seed, pick_device(device), None if names is None else tuple(names), poses, rig, file_format
     )
@@ -624,9 +628,7 @@ def bench_ablation(
     from mmsynth.bench.ablation import bench_ablation as measure
     from mmsynth.fitting.trainer import pick_device
 
-    if steps is not None and budget is not None:
-        raise InputError("--steps and --budget: give one of the two.")
-    seconds = _seconds(budget or "60s") if steps is None else None
+    seconds = _length(steps, budget, "60s")
     chosen = None if only is None else [name.strip() for name in only.split(",")]
     with _bar("bench ablation", as_json) as show:
         report = measure(_scene_path(scene), table, out, steps, seconds, _seeds(seeds), chosen, show, pick_device(device))

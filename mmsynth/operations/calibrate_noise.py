@@ -24,9 +24,9 @@ from mmsynth.files import write_atomic, write_json
 from mmsynth.operations.progress import Counter, Progress
 from mmsynth.scene.images import read_native, used_bits
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
-from mmsynth.sensors.mosaic import channel_map, crop_pattern
+from mmsynth.sensors.mosaic import channel_map, crop_pattern, photosites_of
 from mmsynth.sensors.noise import NoiseModel
-from mmsynth.sensors.photon_transfer import PhotonTransfer, photon_transfer_of_frames
+from mmsynth.sensors.photon_transfer import UNCLIPPED, PhotonTransfer, photon_transfer_of_frames
 from mmsynth.sensors.sensor_file import SensorFile, save_sensor
 
 if TYPE_CHECKING:
@@ -211,8 +211,8 @@ def _exposed(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, black: 
     """Exposure of a frame (H, W) in units of the expectation's (H, W, C); the share of its variance that this explains; the expectation at
     that exposure. The exposure is the light of the brighter half in all, less what nobody expected.
     """
-    everywhere = np.take_along_axis(expected, channel_map(pattern, *raw.shape)[..., None], -1)[..., 0] - black
-    good = np.isfinite(everywhere) & (raw < 0.98 * white)
+    everywhere = photosites_of(expected, pattern) - black
+    good = np.isfinite(everywhere) & (raw < UNCLIPPED * white)
     light, seen = everywhere[good], raw[good] - black
     bright = light > max(float(np.median(light)), 0.0) if len(light) else good[good]
     if bright.sum() < _LEAST_LIT:

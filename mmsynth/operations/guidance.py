@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from mmsynth.scene.scene import Sensor
-from mmsynth.sensors.mosaic import channel_map, channels_of
+from mmsynth.sensors.mosaic import channels_of, photosites_of
 
 # of a photosite whose sensor nobody calibrated: shot noise of 10,000 electrons at full scale, and a floor
 SHOT, FLOOR = 1e-4, 1e-6
@@ -56,13 +56,11 @@ def guide(raw: np.ndarray, rendered: np.ndarray, sensor: Sensor, valid: np.ndarr
     Args:
         raw: (H, W) of a mosaic, else (H, W, C), linear. rendered: (H, W, C). valid: (H, W) bool, where the lens has a ray.
     """
-    height, width = rendered.shape[:2]
     clear = np.where(valid[..., None], rendered, 0.0).astype(np.float64)
     if sensor.mosaic is None:
         seen, expected, used = raw.astype(np.float64), clear, np.broadcast_to(valid[..., None], clear.shape)
     else:
-        index = channel_map(sensor.mosaic, height, width)[..., None]
-        seen, expected, used = raw[..., None].astype(np.float64), np.take_along_axis(clear, index, -1), valid[..., None]
+        seen, expected, used = raw[..., None].astype(np.float64), photosites_of(clear, sensor.mosaic)[..., None], valid[..., None]
     # a clipped value says "at least": nothing where the rendering says as much
     used = used & (seen < sensor.saturation)
     variance = SHOT * np.maximum(expected, 0.0) + FLOOR

@@ -22,9 +22,12 @@ from scipy.optimize import minimize
 from scipy.special import log_ndtr
 
 from mmsynth.errors import InputError
-from mmsynth.sensors.mosaic import channel_map
+from mmsynth.sensors.mosaic import photosites_of
 
 _QUANTISATION = 1.0 / 12.0
+UNCLIPPED = 0.98
+"""Of white: values below it are what the photosite measured."""
+
 Wide = tuple[float, float]
 """Variance of what was not expected: in units of what was, and [DN²]."""
 
@@ -204,10 +207,9 @@ def _differences(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, whi
     near = lambda image, step, axis: (np.roll(image, step, axis), np.roll(image, -step, axis))
     # of every channel at every pixel: what lies between the photosites of a channel is seen, too
     square = sum(0.5 * sum((n - expected) ** 2 for n in near(expected, step, axis)) for step, axis in steps)
-    channel = channel_map(pattern, *raw.shape)[..., None]
-    activity = np.take_along_axis(uniform_filter(square, (_WINDOW, _WINDOW, 0), mode="nearest"), channel, -1)[..., 0]
-    expected = np.take_along_axis(expected, channel, -1)[..., 0]
-    usable = np.isfinite(activity) & (maximum_filter(raw, (2 * rows + 1, 2 * columns + 1)) < 0.98 * white)
+    activity = photosites_of(uniform_filter(square, (_WINDOW, _WINDOW, 0), mode="nearest"), pattern)
+    expected = photosites_of(expected, pattern)
+    usable = np.isfinite(activity) & (maximum_filter(raw, (2 * rows + 1, 2 * columns + 1)) < UNCLIPPED * white)
     edge = (rows + _WINDOW // 2, columns + _WINDOW // 2)
     usable[: edge[0]] = usable[-edge[0] :] = False
     usable[:, : edge[1]] = usable[:, -edge[1] :] = False
