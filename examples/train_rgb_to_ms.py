@@ -23,9 +23,9 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from mmsynth import AlignedDataset, InputError, load_scene
-from mmsynth.data import data_folder
-from mmsynth.operations.aligned_dataset import crop_and_flip
-from mmsynth.operations.evaluate import GroundTruth, psnr_from_mse, spectral_angle_deg
+from mmsynth.operations.dataset.aligned import crop_and_flip
+from mmsynth.operations.evaluation.evaluate import GroundTruth, psnr_from_mse, spectral_angle_deg
+from mmsynth.packaged import data_folder
 from mmsynth.scene.images import load_frame
 from mmsynth.sensors.mosaic import demosaic, mosaic
 

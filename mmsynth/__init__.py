@@ -9,44 +9,44 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from mmsynth.version import __version__
+
 # OpenMP's threads spin for milliseconds at every barrier by default, which stalls a fit beside another busy process.
 # A short spin costs nothing alone and was 1.6 times as fast beside one. Read when torch is loaded; a user's own setting stays.
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-
-__version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from mmsynth.errors import InputError
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
     from mmsynth.fitting.trainer import fit
-    from mmsynth.operations.aligned_dataset import AlignedDataset
-    from mmsynth.operations.calibrate_noise import calibrate_noise
-    from mmsynth.operations.conversion import convert
-    from mmsynth.operations.dataset import generate_dataset
-    from mmsynth.operations.evaluate import evaluate
-    from mmsynth.operations.mesh import extract_mesh, write_mesh
-    from mmsynth.operations.simulate import simulate
+    from mmsynth.operations.conversion.methods import convert
+    from mmsynth.operations.dataset.aligned import AlignedDataset
+    from mmsynth.operations.dataset.generate import generate_dataset
+    from mmsynth.operations.evaluation.evaluate import evaluate
+    from mmsynth.operations.mesh.extract import extract_mesh, write_mesh
+    from mmsynth.operations.simulation.calibrate_noise import calibrate_noise
+    from mmsynth.operations.simulation.simulate import simulate
     from mmsynth.scene.load import load_scene
     from mmsynth.sensors.twin import SensorTwin
 
 _HOMES = {
-    "AlignedDataset": "operations.aligned_dataset",
+    "AlignedDataset": "operations.dataset.aligned",
     "InputError": "errors",
     "Field": "field.field",
     "Rendering": "field.field",
     "SensorTwin": "sensors.twin",
-    "calibrate_noise": "operations.calibrate_noise",
+    "calibrate_noise": "operations.simulation.calibrate_noise",
     "Recipe": "fitting.recipe",
     "load_recipe": "fitting.recipe",
     "fit": "fitting.trainer",
-    "convert": "operations.conversion",
-    "generate_dataset": "operations.dataset",
-    "evaluate": "operations.evaluate",
-    "extract_mesh": "operations.mesh",
-    "write_mesh": "operations.mesh",
+    "convert": "operations.conversion.methods",
+    "generate_dataset": "operations.dataset.generate",
+    "evaluate": "operations.evaluation.evaluate",
+    "extract_mesh": "operations.mesh.extract",
+    "write_mesh": "operations.mesh.extract",
     "load_scene": "scene.load",
-    "simulate": "operations.simulate",
+    "simulate": "operations.simulation.simulate",
 }
 __all__ = [
     "AlignedDataset",
@@ -55,6 +55,7 @@ __all__ = [
     "Recipe",
     "Rendering",
     "SensorTwin",
+    "__version__",
     "calibrate_noise",
     "convert",
     "evaluate",

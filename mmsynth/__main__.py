@@ -1,5 +1,5 @@
 """``python -m mmsynth``."""
 
-from mmsynth.cli import main
+from mmsynth.cli.commands import main
 
 main()

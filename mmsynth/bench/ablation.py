@@ -28,10 +28,10 @@ from mmsynth.bench.jobs import Job, mean_over_modalities, run_jobs
 from mmsynth.bench.machine import measure
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table, lookup
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
+from mmsynth.packaged import data_folder
 from mmsynth.scene.scene import canonical_modality
 from mmsynth.toml import first_problem, read_toml
 

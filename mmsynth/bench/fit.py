@@ -14,7 +14,7 @@ from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table, lookup
 from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 
 PSNR_COLUMNS = (
     Column("raw [dB]", "mean/psnr", ".2f"),

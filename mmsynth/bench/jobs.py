@@ -25,13 +25,13 @@ from mmsynth.bench.machine import identify
 from mmsynth.errors import InputError
 from mmsynth.files import read_json, write_json
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene, keep_frames
 
 _PACKAGE = Path(mmsynth.__file__).parent
 # what a fit and its score run through
-_CODE = ("field", "fitting", "scene", "sensors", "operations/evaluate.py", "bench/worker.py")
+_CODE = ("field", "fitting", "scene", "sensors", "operations/evaluation", "bench/worker.py")
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
 from mmsynth.fitting import losses
 from mmsynth.fitting.measurements import Batch
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.scene import Sensor
 
 REPEATS = 9

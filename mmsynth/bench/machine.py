@@ -14,8 +14,8 @@ import numba
 import numpy as np
 import torch
 
-import mmsynth
 from mmsynth.errors import InputError
+from mmsynth.version import __version__
 
 # instruction sets that decide the speed of the kernels
 _FLAGS = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "avx512_bf16", "avx512_vnni", "amx_tile", "neon", "sve")
@@ -39,7 +39,7 @@ def identify() -> dict[str, Any]:
         "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
         "system": platform.system(),
         "versions": {
-            "mmsynth": mmsynth.__version__,
+            "mmsynth": __version__,
             "python": platform.python_version(),
             "torch": torch.__version__,
             "numba": numba.__version__,

@@ -16,7 +16,7 @@ from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table, lookup
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 
 RESOLUTIONS = (64, 128, 256, 512)
 

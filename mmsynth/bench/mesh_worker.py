@@ -17,9 +17,9 @@ from mmsynth.bench.machine import peak_memory
 from mmsynth.bench.worker import serve
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
-from mmsynth.operations.mesh import extract_mesh
-from mmsynth.operations.mesh_attributes import views_of
-from mmsynth.operations.mesh_report import compare, describe, load_reference
+from mmsynth.operations.mesh.attributes import views_of
+from mmsynth.operations.mesh.extract import extract_mesh
+from mmsynth.operations.mesh.report import compare, describe, load_reference
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 

@@ -17,7 +17,7 @@ import numpy as np
 from mmsynth.bench.machine import use_threads
 from mmsynth.bench.tables import Column, Table
 from mmsynth.errors import InputError
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 
 REPEATS = 7
 

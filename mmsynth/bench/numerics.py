@@ -24,7 +24,7 @@ from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, typi
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.field.kernels import reference
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 from mmsynth.sensors import lenses
 from mmsynth.sensors.camera import Camera, unproject
 from mmsynth.sensors.mosaic import demosaic, demosaic_edge_aware, mosaic

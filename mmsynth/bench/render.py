@@ -31,7 +31,7 @@ from mmsynth.field import rendering
 from mmsynth.field.field import TILE, Field
 from mmsynth.field.kernels import reference
 from mmsynth.field.rendering import Sampling
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
 

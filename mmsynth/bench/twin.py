@@ -24,7 +24,7 @@ from mmsynth.bench.machine import measure
 from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, measured_methods, typical
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
-from mmsynth.operations.progress import Progress
+from mmsynth.operations.output.progress import Progress
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.noise import NoiseModel, record
 from mmsynth.sensors.photon_transfer import photon_transfer, photon_transfer_of_frames
@@ -157,7 +157,7 @@ def _star(camera: Camera) -> Tensor:
 
 def of_the_field(field: Field) -> list[Method]:
     """The first sensor of a fitted field, rays per pixel along each axis, against 8 x 8."""
-    from mmsynth.operations.simulate import Simulated, render_light
+    from mmsynth.operations.simulation.simulate import Simulated, render_light
 
     name = next(iter(field.sensors))
     camera = field.cameras[name]

@@ -24,7 +24,7 @@ from mmsynth.field.kernels import announce_compilation
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.trainer import fit
-from mmsynth.operations.evaluate import evaluate
+from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.scene.load import load_scene
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
-from mmsynth.field.kernels.cpu_blocks import FEATURES
+from mmsynth.field.kernels.cpu.blocks import FEATURES
 
 _START = 1e-4  # features of a new level are that small
 

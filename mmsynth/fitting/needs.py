@@ -15,7 +15,7 @@ import numpy as np
 from mmsynth.field.field import Design
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.tables import rows_log2
+from mmsynth.fitting.table_sizes import rows_log2
 from mmsynth.scene.scene import Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared

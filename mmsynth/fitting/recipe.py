@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
+from mmsynth.packaged import data_folder
 from mmsynth.toml import read_toml
 
 

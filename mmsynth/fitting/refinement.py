@@ -11,9 +11,10 @@ from torch import Tensor
 
 from mmsynth.field import rendering
 from mmsynth.field.field import Corrections, Field
-from mmsynth.fitting import losses, poses
+from mmsynth.fitting import losses
+from mmsynth.fitting import motions as poses
 from mmsynth.fitting.measurements import Batch, Measurements, in_order
-from mmsynth.fitting.poses import Equations, Motions, Rows
+from mmsynth.fitting.motions import Equations, Motions, Rows
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.scene.scene import Scene
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 
-import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
@@ -26,14 +25,15 @@ from mmsynth.files import write_text
 from mmsynth.fitting import losses, probe
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
 from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
+from mmsynth.fitting.motions import Rows
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.optimiser import Adam, Average
-from mmsynth.fitting.poses import Rows
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.refinement import Refinement, see
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
-from mmsynth.fitting.tables import cells_at_surface, rows_log2
+from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
 from mmsynth.scene.scene import Scene
+from mmsynth.version import __version__
 
 CHECKPOINT_SECONDS = 60.0
 PROBE_RAYS = 2048  # per modality
@@ -484,7 +484,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
     field.corrections = trainer.refinement.corrections()
     field.rig = {n: pose @ field.corrections.sensors.get(n, np.eye(4)) for n, pose in field.rig.items()}
     field.manifest = {
-        "mmsynth": mmsynth.__version__,
+        "mmsynth": __version__,
         "scene": {
             "path": str(scene.root.resolve()),
             "format": scene.format,

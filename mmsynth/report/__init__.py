@@ -1,0 +1,1 @@
+"""Results to look at: ``report.html`` of a run, and tables in the terminal."""

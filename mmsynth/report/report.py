@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_text
-from mmsynth.operations import previews
+from mmsynth.operations.output import previews
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor
 from mmsynth.sensors.mosaic import channels_of, demosaic_edge_aware, is_bayer

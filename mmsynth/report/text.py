@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mmsynth.operations.calibrate_noise import Calibrated
+    from mmsynth.operations.simulation.calibrate_noise import Calibrated
 
 _COLUMNS = {
     "psnr": "psnr [dB]",

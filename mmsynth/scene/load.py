@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.scene.middlebury import read_middlebury
-from mmsynth.scene.mmsdata import read_mmsdata
-from mmsynth.scene.nerfstudio import read_nerfstudio
+from mmsynth.scene.layouts.middlebury import read_middlebury
+from mmsynth.scene.layouts.mmsdata import read_mmsdata
+from mmsynth.scene.layouts.nerfstudio import read_nerfstudio
 from mmsynth.scene.scene import Frame, Region, Scene
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 

@@ -273,7 +273,7 @@ def read_poses(path: Path) -> list[Pose]:
         elif "camera_path" in content:
             poses = _read_camera_path(content, path)
         elif "modalities" in content:
-            from mmsynth.scene.mmsdata import read_reference_poses  # which is built on this module
+            from mmsynth.scene.layouts.mmsdata import read_reference_poses  # which is built on this module
 
             poses = [*read_reference_poses(path)]
         elif "rig" in content:

@@ -62,6 +62,21 @@ class Sensor:
 
 
 @dataclass(frozen=True)
+class PosedCamera:
+    """A camera at its place: all that it takes to render a picture or to project points.
+
+    Attributes:
+        camera: intrinsics and lens.
+        camera_to_world: (4, 4) float64, rigid, OpenCV axes, in the scene's frame and unit.
+        name: what files made of it are called; empty where nothing is.
+    """
+
+    camera: Camera
+    camera_to_world: np.ndarray
+    name: str = ""
+
+
+@dataclass(frozen=True)
 class Frame:
     """One image of one sensor.
 

@@ -1,0 +1,4 @@
+"""How a sensor measures light: functions on torch tensors, batched and differentiable.
+
+Start with ``camera`` (rays and pixels), ``mosaic`` and ``polarization``; ``twin`` puts all effects of a sensor together.
+"""

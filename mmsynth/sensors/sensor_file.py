@@ -16,9 +16,9 @@ import numpy as np
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.files import write_text
+from mmsynth.packaged import data_folder
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.polarization import OffAxis

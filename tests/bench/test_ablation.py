@@ -12,9 +12,9 @@ from rows import measured
 from mmsynth.bench import jobs
 from mmsynth.bench.ablation import Variant, bench_ablation, compare, load_table, plot, tables_of
 from mmsynth.bench.jobs import Job
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.packaged import data_folder
 
 EXAMPLE = data_folder("example_scene")
 PACKAGED = sorted(path.stem for path in (data_folder("recipes") / "bench").glob("*.toml"))

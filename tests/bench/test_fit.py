@@ -12,9 +12,9 @@ from rows import measured
 from mmsynth.bench import fit as bench
 from mmsynth.bench import jobs
 from mmsynth.bench.jobs import Job
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import load_recipe
+from mmsynth.packaged import data_folder
 
 EXAMPLE = data_folder("example_scene")
 

@@ -15,9 +15,9 @@ from rows import measured, scores
 
 from mmsynth.bench import jobs as jobs_module
 from mmsynth.bench.jobs import Job, code_hash, identity, mean_over_modalities, run_job, run_jobs, scene_hash
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mmsynth.field.kernels import cpu, cpu_shading
+from mmsynth.field.kernels import cpu
+from mmsynth.field.kernels.cpu import shading as cpu_shading
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting import losses
 from mmsynth.fitting.measurements import Batch

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from mmsynth.fitting import poses
-from mmsynth.fitting.poses import Layout, Motions, Rows
+from mmsynth.fitting import motions as poses
+from mmsynth.fitting.motions import Layout, Motions, Rows
 from mmsynth.scene.scene import Frame, Region
 from mmsynth.sensors.camera import Camera
 

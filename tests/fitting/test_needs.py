@@ -142,7 +142,7 @@ def _needs(scene: Scene, **recipe: object) -> Needs:
 
 
 def test_a_modality_with_few_frames_is_scarce() -> None:
-    from mmsynth.data import data_folder
+    from mmsynth.packaged import data_folder
 
     scene = load_scene(data_folder("example_scene"))
     assert _needs(scene).scarce == ()
@@ -152,7 +152,7 @@ def test_a_modality_with_few_frames_is_scarce() -> None:
 
 
 def test_a_scarce_modality_leaves_geometry_and_appearance_alone() -> None:
-    from mmsynth.data import data_folder
+    from mmsynth.packaged import data_folder
 
     scene = keep_frames(load_scene(data_folder("example_scene"), ["rgb", "pol"]), {"rgb": 1})
     trainer = Trainer(scene, Recipe.model_validate({**SMALL, "eikonal": 0.0}), 10, None, 0, "cpu")

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from mmsynth.data import data_folder
 from mmsynth.field.field import Field
-from mmsynth.fitting import poses
+from mmsynth.fitting import motions as poses
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer, fit
-from mmsynth.operations.convert import source_views
+from mmsynth.operations.conversion.files import source_views
+from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Scene, keep_frames
 

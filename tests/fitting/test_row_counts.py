@@ -9,14 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmsynth.data import data_folder
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Design, Field
 from mmsynth.fitting import trainer as trainer_module
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.tables import cells_at_surface, rows_log2
+from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
 from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region, Scene, Sensor
 

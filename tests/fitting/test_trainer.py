@@ -15,7 +15,6 @@ import pytest
 import torch
 from conftest import ring
 
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
@@ -27,7 +26,8 @@ from mmsynth.fitting.measurements import draw, load_measurements
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
 from mmsynth.fitting.trainer import Trainer, fit, pick_device, rig_of
-from mmsynth.operations.evaluate import evaluate
+from mmsynth.operations.evaluation.evaluate import evaluate
+from mmsynth.packaged import data_folder
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split

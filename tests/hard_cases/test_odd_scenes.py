@@ -15,10 +15,10 @@ from small_scenes import FOCAL, HEIGHT, QUICK, RADIUS, WIDTH, around, look_from,
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
-from mmsynth.fitting import poses as motions
+from mmsynth.fitting import motions
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.trainer import fit
-from mmsynth.operations.evaluate import evaluate
+from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map

@@ -14,7 +14,8 @@ from usual import nerfacc_keeps, neus_weights
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Design, Field
-from mmsynth.field.kernels import OUTSIDE, SHELL, cpu_rays, reference
+from mmsynth.field.kernels import OUTSIDE, SHELL, reference
+from mmsynth.field.kernels.cpu import rays as cpu_rays
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.rendering import Hits, Sampling, ball_interval, trace, trace_by_parts
 from mmsynth.field.surface import Surface

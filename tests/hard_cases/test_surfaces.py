@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.operations.mesh import extract_mesh
+from mmsynth.operations.mesh.extract import extract_mesh
 from mmsynth.scene.scene import Region, Sensor
 
 Row = Callable[[str, str, str], None]

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
+from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene, keep_frames, make_split
 

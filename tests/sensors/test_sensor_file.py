@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from mmsynth.data import data_folder
 from mmsynth.errors import InputError
+from mmsynth.packaged import data_folder
 from mmsynth.sensors.camera import Camera, Lens
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.sensor_file import (

@@ -1,0 +1,354 @@
+"""Shading on the CPU, fused: from the features of rays to the loss of what was measured along them, and all its gradients, in one pass.
+
+Work is cut into chunks of ``CHUNK`` rays, which pass the layers of the shader as matrices with a row per ray. A ray needs few of the
+shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights are summed per
+chunk and the chunks in order, whatever the number of threads.
+
+Matrices have whole tiles: they are padded with zeros, rows to a multiple of ``TALL``, columns to one of ``WIDE``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from llvmlite import ir
+from numba import get_thread_id, njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from mmsynth.field.kernels.cpu.blocks import splat
+
+CHUNK = 64  # rays
+TALL, WIDE = 4, 16
+TERMS = 16  # spherical harmonics up to degree 3
+HUBER = np.float32(0.5)  # as in losses.photometric
+_FAST = {"contract", "reassoc", "nsz", "arcp"}  # but NaN stays NaN: a loss that is not finite must be seen
+_VECTOR = ir.VectorType(ir.FloatType(), WIDE)
+_BYTE, _I64 = ir.IntType(8), ir.IntType(64)
+
+
+@intrinsic
+def _add_tile(typingctx, a, b, out, row, inner, column):  # type: ignore[no-untyped-def]
+    """out += a @ b, for the tile of ``out`` that begins at (row, column). Its sums stay in registers: LLVM would not find that."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        row, inner, column = args[3:]
+        zero = ir.Constant(_I64, 0)
+        rows = [ir.Constant(_I64, r) for r in range(TALL)]
+
+        def element(which, i, j):  # type: ignore[no-untyped-def]
+            """Address of an element, and its array's strides."""
+            array = context.make_array(signature.args[which])(context, builder, args[which])
+            strides = cgutils.unpack_tuple(builder, array.strides, 2)
+            data = builder.bitcast(array.data, _BYTE.as_pointer())
+            return builder.gep(data, [builder.add(builder.mul(i, strides[0]), builder.mul(j, strides[1]))]), *strides
+
+        def after(address, stride, count, kind):  # type: ignore[no-untyped-def]
+            return builder.bitcast(builder.gep(address, [builder.mul(stride, count)]), kind.as_pointer())
+
+        left, down, along = element(0, row, zero)
+        right, onward, _ = element(1, zero, column)
+        tile, across, _ = element(2, row, column)
+        targets = [after(tile, across, r, _VECTOR) for r in rows]
+        sums = [cgutils.alloca_once_value(builder, builder.load(target, align=4)) for target in targets]
+        with cgutils.for_range(builder, inner) as loop:
+            vector = builder.load(after(right, onward, loop.index, _VECTOR), align=4)
+            values = builder.gep(left, [builder.mul(along, loop.index)])
+            for r, total in zip(rows, sums, strict=True):
+                value = splat(builder, builder.load(after(values, down, r, ir.FloatType())), _VECTOR)
+                product = builder.fmul(value, vector, flags=("contract",))
+                builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+        for target, total in zip(targets, sums, strict=True):
+            builder.store(builder.load(total), target, align=4)
+        return context.get_dummy_value()
+
+    return types.void(a, b, out, row, inner, column), codegen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def]
+    """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
+    for row in range(0, rows, TALL):
+        for column in range(0, columns, WIDE):
+            _add_tile(a, b, out, row, inner, column)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _clear(out, rows, columns):  # type: ignore[no-untyped-def]
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = np.float32(0.0)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _whole(count, of):  # type: ignore[no-untyped-def]
+    """``count`` rounded up to a multiple."""
+    return (count + of - 1) // of * of
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _padded(matrix):  # type: ignore[no-untyped-def]
+    """A copy of whole tiles, whichever way round it is used."""
+    out = np.zeros((_whole(matrix.shape[0], WIDE), _whole(matrix.shape[1], WIDE)), np.float32)
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[i, j] = matrix[i, j]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
+    """Real spherical harmonics (see ``encoding.spherical_harmonics``); terms above the degree are left as they are."""
+    f = np.float32
+    out[0] = f(0.28209479177387814)
+    if degree < 1:
+        return
+    out[1] = f(0.4886025119029199) * y
+    out[2] = f(0.4886025119029199) * z
+    out[3] = f(0.4886025119029199) * x
+    if degree < 2:
+        return
+    xx, yy, zz = x * x, y * y, z * z
+    out[4] = f(1.0925484305920792) * x * y
+    out[5] = f(1.0925484305920792) * y * z
+    out[6] = f(0.31539156525252005) * (f(3.0) * zz - f(1.0))
+    out[7] = f(1.0925484305920792) * x * z
+    out[8] = f(0.5462742152960396) * (xx - yy)
+    if degree < 3:
+        return
+    out[9] = f(0.5900435899266435) * y * (f(3.0) * xx - yy)
+    out[10] = f(2.890611442640554) * x * y * z
+    out[11] = f(0.4570457994644658) * y * (f(5.0) * zz - f(1.0))
+    out[12] = f(0.3731763325901154) * z * (f(5.0) * zz - f(3.0))
+    out[13] = f(0.4570457994644658) * x * (f(5.0) * zz - f(1.0))
+    out[14] = f(1.445305721320277) * z * (xx - yy)
+    out[15] = f(0.5900435899266435) * x * (xx - f(3.0) * yy)
+
+
+@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+def _layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
+    """out = rectified (x @ weight + bias), of n rays. weight: (inputs, units)."""
+    rows, units = _whole(n, TALL), out.shape[1]
+    _clear(out, rows, units)
+    for i in range(n):
+        for k in range(len(bias)):
+            out[i, k] = bias[k]
+    _add_product(x, weight, out, rows, inputs, units)
+    for i in range(n):
+        for k in range(units):
+            v = out[i, k]
+            out[i, k] = np.float32(0.0) if v <= np.float32(0.0) else v
+
+
+@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+def _layer_backward(n, x, inputs, g, out, weight_out, bias_out):  # type: ignore[no-untyped-def]
+    """Gradients of a layer's weights (units, inputs); g: those of what came out, then those before the rectification."""
+    units = g.shape[1]
+    for i in range(n):
+        for k in range(units):
+            g[i, k] = g[i, k] if out[i, k] > np.float32(0.0) else np.float32(0.0)
+            bias_out[k] += g[i, k]
+    _add_product(g.T, x, weight_out, units, n, inputs)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _softplus(x):  # type: ignore[no-untyped-def]
+    """log (1 + exp x), and its slope."""
+    one = np.float32(1.0)
+    small = np.float32(math.exp(-abs(x)))
+    return max(x, np.float32(0.0)) + np.float32(math.log1p(small)), (one if x > np.float32(0.0) else small) / (one + small)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
+    """|Lᵀ e|² (see ``radiance.intensity``) and its slope, both of six numbers."""
+    two = np.float32(2.0)
+    a, slope_a = _softplus(raw[0])
+    b, slope_b = _softplus(raw[1])
+    c, slope_c = _softplus(raw[2])
+    v0 = a * e[0] + raw[3] * e[1] + raw[4] * e[2]
+    v1 = b * e[1] + raw[5] * e[2]
+    v2 = c * e[2]
+    slope[0], slope[1], slope[2] = two * v0 * e[0] * slope_a, two * v1 * e[1] * slope_b, two * v2 * e[2] * slope_c
+    slope[3], slope[4], slope[5] = two * v0 * e[1], two * v0 * e[2], two * v1 * e[2]
+    return v0 * v0 + v1 * v1 + v2 * v2
+
+
+@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+def _numbers(  # type: ignore[no-untyped-def]
+    begin, numbers, hidden, opacity, teaches, target, ray, output, axes, level, saturation, weight, gain, heads, heads_bias,
+    learn, squared, g_hidden, g_opacity, g_gain, heads_out, heads_bias_out,
+):  # fmt: skip
+    """What was measured along the rays of a chunk, of which ``begin`` is the first: the loss. Gradients are added to.
+
+    numbers: the first, and where they end. hidden: (n, H), a row per ray.
+    """
+    raw, slope = np.empty(6, np.float32), np.empty(6, np.float32)
+    bright = len(ray) - len(axes)
+    units = heads.shape[1]
+    loss = 0.0
+    for m in range(numbers[0], numbers[1]):
+        o, first = ray[m], output[m]
+        h, g = hidden[o - begin], g_hidden[o - begin]
+        outputs = 1 if m < bright else 6
+        for j in range(outputs):
+            w = heads[first + j]
+            total = np.float32(0.0)
+            for k in range(units):
+                total += w[k] * h[k]
+            raw[j] = total + heads_bias[first + j]
+        if m < bright:
+            light, slope[0] = _softplus(raw[0])
+        else:
+            light = _intensity(raw, axes[m - bright], slope)
+        brightness = level[m]  # of what is fully seen
+        if len(gain):
+            brightness *= gain[m]
+        difference = light * brightness * opacity[o] - target[m]
+        # a clipped pixel only says "at least"
+        if target[m] >= saturation[m] and difference > np.float32(0.0):
+            difference = np.float32(0.0)
+        squared[m] = difference * difference
+        relative = difference / level[m]
+        size = abs(relative)
+        huber = np.float32(0.5) * size * size if size < HUBER else HUBER * (size - np.float32(0.5) * HUBER)
+        loss += np.float64(weight[m] * huber)
+        if not learn:
+            continue
+        pull = weight[m] / level[m] * min(max(relative, -HUBER), HUBER)
+        if len(gain):
+            g_gain[m] = pull * light * level[m] * opacity[o]
+        if teaches[o]:
+            g_opacity[o] += pull * light * brightness
+        for j in range(outputs):
+            w, w_out = heads[first + j], heads_out[first + j]
+            p = pull * brightness * opacity[o] * slope[j]
+            heads_bias_out[first + j] += p
+            for k in range(units):
+                w_out[k] += p * h[k]
+            if teaches[o]:
+                for k in range(units):
+                    g[k] += p * w[k]
+    return loss
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _first_at(ray, begin):  # type: ignore[no-untyped-def]
+    """The first number of a ray or of those after it, by bisection."""
+    low, high = 0, len(ray)
+    while low < high:
+        middle = (low + high) // 2
+        if ray[middle] < begin:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _chunk(  # type: ignore[no-untyped-def]
+    begin, n, features, opacity, directions, degrees, teaches, target, ray, output, axes, level, saturation, weight, gain,
+    first, first_turned, first_bias, second, second_turned, second_bias, heads, heads_bias, learn,
+    x, h1, h2, g1, g2, squared, g_features, g_opacity, g_gain,
+    first_out, first_bias_out, second_out, second_bias_out, heads_out, heads_bias_out,
+):  # fmt: skip
+    """The loss of n rays, and its gradients where ``learn``."""
+    width = features.shape[1]
+    degree = np.int64(0)
+    for i in range(n):
+        degree = max(degree, degrees[begin + i])  # terms of a higher one than any here are zero
+    rows, inputs, used = _whole(n, TALL), _whole(width + (TERMS if degree else 1), WIDE), _whole(width, WIDE)
+    units = h1.shape[1]
+    _clear(x, rows, inputs)
+    _clear(g2, rows, units)
+    for i in range(n):
+        o = begin + i
+        for j in range(width):
+            x[i, j] = features[o, j]
+        _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degrees[o], x[i, width:])
+        g_opacity[o] = np.float32(0.0)
+    _layer(n, x, inputs, first_turned, first_bias, h1)
+    _layer(n, h1, units, second_turned, second_bias, h2)
+    if learn:
+        first_out[:], second_out[:], heads_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        first_bias_out[:], second_bias_out[:], heads_bias_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    numbers = _first_at(ray, begin), _first_at(ray, begin + n)
+    loss = _numbers(
+        begin, numbers, h2, opacity, teaches, target, ray, output, axes, level, saturation, weight, gain, heads, heads_bias,
+        learn, squared, g2, g_opacity, g_gain, heads_out, heads_bias_out,
+    )  # fmt: skip
+    if learn:
+        _layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
+        _clear(g1, rows, units)
+        _add_product(g2, second, g1, rows, units, units)
+        _layer_backward(n, x, inputs, g1, h1, first_out, first_bias_out)
+        _clear(x, rows, used)
+        _add_product(g1, first, x, rows, units, used)
+        for i in range(n):
+            for j in range(width):
+                g_features[begin + i, j] = x[i, j]
+    return loss
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def compare(  # type: ignore[no-untyped-def]
+    features, opacity, directions, degrees, teaches, target, ray, output, axes, level, saturation, weight, gain,
+    first, first_bias, second, second_bias, heads, heads_bias, learn, x_of, h1_of, h2_of, g1_of, g2_of,
+    loss, squared, g_features, g_opacity, g_gain,
+    first_out, first_bias_out, second_out, second_bias_out, heads_out, heads_bias_out,
+):  # fmt: skip
+    """See ``losses.compare``. ``ray`` never decreases; ``gain`` may be empty; the loss and gradients of weights are per chunk.
+
+    Scratch, a slot per thread: x_of (what goes into the shader), h1_of, h2_of (its hidden layers), g1_of, g2_of (their gradients).
+    """
+    rays = len(features)
+    first_padded, first_turned = _padded(first), _padded(first.T)
+    second_padded, second_turned = _padded(second), _padded(second.T)
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        chunk, slot = np.int64(task), np.int64(get_thread_id())
+        begin = chunk * CHUNK
+        loss[chunk] = _chunk(
+            begin, min(CHUNK, rays - begin), features, opacity, directions, degrees, teaches,
+            target, ray, output, axes, level, saturation, weight, gain,
+            first_padded, first_turned, first_bias, second_padded, second_turned, second_bias, heads, heads_bias, learn,
+            x_of[slot], h1_of[slot], h2_of[slot], g1_of[slot], g2_of[slot], squared, g_features, g_opacity, g_gain,
+            first_out[chunk], first_bias_out[chunk], second_out[chunk], second_bias_out[chunk], heads_out[chunk], heads_bias_out[chunk],
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shade_chunk(  # type: ignore[no-untyped-def]
+    begin, n, features, directions, degree, first, first_bias, second, second_bias, heads, heads_bias, outputs
+):  # fmt: skip
+    """Outputs of n rays. Matrices have a column per unit, and whole tiles."""
+    width, rows = features.shape[1], _whole(n, TALL)
+    x = np.zeros((rows, first.shape[0]), np.float32)
+    h1, h2 = np.empty((rows, first.shape[1]), np.float32), np.empty((rows, second.shape[1]), np.float32)
+    out = np.zeros((rows, heads.shape[1]), np.float32)
+    for i in range(n):
+        o = begin + i
+        for j in range(width):
+            x[i, j] = features[o, j]
+        _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degree, x[i, width:])
+    _layer(n, x, _whole(width + (TERMS if degree else 1), WIDE), first, first_bias, h1)
+    _layer(n, h1, h1.shape[1], second, second_bias, h2)
+    _add_product(h2, heads, out, rows, h2.shape[1], out.shape[1])
+    for i in range(n):
+        for k in range(len(heads_bias)):
+            outputs[begin + i, k] = out[i, k] + heads_bias[k]
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def shade(  # type: ignore[no-untyped-def]
+    features, directions, degree, first, first_bias, second, second_bias, heads, heads_bias, outputs
+):  # fmt: skip
+    """See ``radiance.Shader.forward``, of rays that all have one degree."""
+    rays = len(features)
+    first_turned, second_turned, heads_turned = _padded(first.T), _padded(second.T), _padded(heads.T)
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        begin = np.int64(task) * CHUNK
+        _shade_chunk(
+            begin, min(CHUNK, rays - begin), features, directions, degree,
+            first_turned, first_bias, second_turned, second_bias, heads_turned, heads_bias, outputs,
+        )  # fmt: skip

@@ -1,0 +1,394 @@
+"""An aligned multimodal dataset from any poses: every modality, depth, normals, opacity and mask, with all that a reader must know.
+
+Layout of ``<out>``::
+
+    dataset.json             conventions, sensors, unit, field hash, recipe, versions; per file sha256, bytes, arrays (shape, dtype, unit)
+    transforms.json          the views as nerfstudio reads them (OpenGL axes, pixel centres at +0.5), images = views/NNNN/image.png
+    views/NNNN/
+        rgb.npz ms.npz ...   one record per modality (see ``records``): data, stokes
+        geometry.npz         depth_z, depth_ray, normal, normal_camera, opacity, mask (opacity > 0.5), valid, coverage (see ``coverage``),
+                             saturated_rgb ... (where that sensor would have clipped)
+        flow.npz             flow to the next view, occluded (see ``flow``); the last view has none
+        image.png            16-bit linear picture of the first modality (for transforms.json and for looking)
+        view.json            camera and pose per modality, the files and their hashes; written last: the view is complete
+    raw/                     where sensors were asked for: their raw frames, a scene in the layout of MMS-DATA (see ``simulate``)
+
+As ``exr`` or ``tiff`` the records are of that type. ``webdataset`` packs 64 views at a time into shards/NNNNNN.tar, whose sidecar is
+written last, and removes their folders. ``mms-data`` puts the modalities into modalities/NAME/NNNN.tiff (16 bits, clipped to [0, 1]) with
+a meta_data.json, a scene that can be fitted. On the native rig every modality has a grid of its own: ``geometry_NAME``, ``flow_NAME``,
+``image_NAME`` and ``transforms_NAME.json`` instead.
+
+A run that is interrupted goes on where it was: a view whose ``view.json`` belongs to the same request and whose files have the
+stated hashes is not rendered again. The same field and request give the same bytes, in one process or in many.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.files import sha256_of, write_json
+from mmsynth.operations.dataset.index import PER_SHARD, drop_views, finished_shard, finished_view, pack_shard, shard_name, view_folder
+from mmsynth.operations.output.previews import preview_linear
+from mmsynth.operations.output.progress import Counter, Progress
+from mmsynth.operations.output.records import (
+    CONVENTIONS,
+    UNITS,
+    camera_json,
+    field_hash,
+    modality_arrays,
+    read_record,
+    sensor_json,
+    write_record,
+)
+from mmsynth.operations.output.records import FORMATS as RECORD_FORMATS
+from mmsynth.operations.output.work_partition import Share
+from mmsynth.operations.simulation.simulate import simulate
+from mmsynth.operations.views.coverage import TrainingRays, coverage
+from mmsynth.operations.views.flow import optical_flow
+from mmsynth.operations.views.trajectories import View
+from mmsynth.scene.images import write_png16
+from mmsynth.scene.layouts.mmsdata import meta_content
+from mmsynth.scene.poses import OPENGL_TO_OPENCV
+from mmsynth.scene.scene import canonical_modality
+from mmsynth.sensors.camera import Camera
+from mmsynth.version import __version__
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field, Rendering
+
+RIGS = ("aligned", "native")
+FORMATS = (*RECORD_FORMATS, "webdataset", "mms-data")
+OUTPUTS = ("geometry", "flow", "coverage")
+LAYOUT = 2
+
+Placed = dict[str, tuple[Camera, np.ndarray]]  # camera and pose of each modality at one view
+
+
+def generate_dataset(
+    field: Field,
+    views: Sequence[View],
+    out: Path | str,
+    modalities: Sequence[str] | None = None,
+    rig: str = "aligned",
+    format: str = "npz",
+    outputs: Sequence[str] | None = None,
+    rays: TrainingRays | None = None,
+    sensors: Sequence[str | Path] = (),
+    seed: int = 0,
+    share: Share | None = None,
+    progress: Progress | None = None,
+) -> Path | None:
+    """Render all modalities at all views and write them as a dataset (layout: module docstring).
+
+    Args:
+        views: (camera, camera_to_world, name); ``trajectories.load_views`` makes them.
+        modalities: names or aliases; None: all of the field.
+        rig: "aligned": every modality on the view's own pixel grid; "native": the view is the reference sensor's and every other
+            modality is seen by its own camera from its own place on the rig.
+        format: "npz", "exr" (named float channels), "tiff" (16-bit images, float geometry), "webdataset" or "mms-data".
+        outputs: of "geometry", "flow" and "coverage", what is wanted beside the modalities; None: all of it, coverage with ``rays`` only.
+        rays: of the training frames (``coverage.training_rays``). sensors: files of those whose raw frames at these views go into raw/, a
+            scene of its own (see ``simulate``, also for ``seed``). share: the part of the views that this process renders, None: all.
+        progress: called with (rays done, rays in all); finished views count at once. Raw frames come after them, and count anew.
+    Returns:
+        the path of ``dataset.json``; None where other processes have not finished their views yet: the last one writes it.
+    Raises:
+        InputError: no views, unknown modality, rig, format or output, a modality without a place on the rig, a camera that the format
+            does not hold, or the disk refused.
+    """
+    plan = _planned(field, views, Path(out), modalities, rig, format, outputs, rays)
+    mine = (share or Share()).of(len(views), PER_SHARD if format == "webdataset" else 1)
+    costs = [sum(cameras[group[0]][0].width * cameras[group[0]][0].height for group in plan.groups) for cameras in plan.placed]
+    count = Counter(progress, sum(costs[i] for i in mine))
+    ahead: dict[int, list[Rendering]] = {}  # the next view, rendered already for the flow to it
+    goal = 0
+    for index in mine:
+        goal += costs[index]
+        if plan.finished(index) is None:
+            (plan.out / "dataset.json").unlink(missing_ok=True)  # it must not vouch for views of another request
+            here = ahead.pop(index) if index in ahead else _render(plan, index, count)
+            following = _following(plan, index, index + 1 in mine, ahead, count)
+            _write_view(plan, index, here, following)
+        count(max(0, goal - count.done))
+        if format == "webdataset" and (index + 1 in (mine.stop, len(views)) or (index + 1) % PER_SHARD == 0):
+            first = index // PER_SHARD * PER_SHARD
+            if plan.shard(index) is None:
+                pack_shard(plan.out, shard_name(index), range(first, index + 1))
+                plan.shard(index)
+    raw = simulate(field, sensors, views, plan.out / "raw", seed, rig=rig, share=share, progress=progress) if sensors else None
+    return None if sensors and raw is None else _summary(plan, raw, seed)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be made. keys: hash of everything that decides a view's files; it, placed (cameras) and stated by view. shards: finished
+    ones, by name."""
+
+    field: Field
+    out: Path
+    rig: str
+    format: str
+    outputs: tuple[str, ...]
+    rays: TrainingRays | None
+    request: dict[str, Any]
+    groups: list[list[str]]
+    placed: list[Placed]
+    stated: list[dict[str, Any]]
+    keys: list[str]
+    shards: dict[str, list[dict[str, Any]]]
+
+    def finished(self, index: int) -> dict[str, Any] | None:
+        """What the sidecar of a finished view says, be it in a folder or in a shard."""
+        if self.format == "webdataset":
+            shard = self.shard(index)
+            if shard is not None:
+                return shard[index % PER_SHARD]
+        return finished_view(self.out, index, self.keys[index])
+
+    def shard(self, index: int) -> list[dict[str, Any]] | None:
+        name, first = shard_name(index), index // PER_SHARD * PER_SHARD
+        if name not in self.shards:
+            made = finished_shard(self.out, name, self.keys[first : first + PER_SHARD])
+            if made is None:
+                return None
+            self.shards[name] = made
+            drop_views(self.out, range(first, first + len(made)))  # left over where a run was cut off
+        return self.shards[name]
+
+
+def _planned(
+    field: Field,
+    views: Sequence[View],
+    out: Path,
+    modalities: Sequence[str] | None,
+    rig: str,
+    format: str,
+    outputs: Sequence[str] | None,
+    rays: TrainingRays | None,
+) -> _Plan:
+    if rig not in RIGS:
+        raise InputError(f"dataset: rig is {rig!r}, expected one of {', '.join(RIGS)}.")
+    if format not in FORMATS:
+        raise InputError(f"dataset: format is {format!r}, expected one of {', '.join(FORMATS)}.")
+    if not views:
+        raise InputError("dataset: no views, expected at least one.")
+    names = field.check_modalities(None if modalities is None else [canonical_modality(m) for m in modalities])
+    if not names:
+        raise InputError("dataset: no modalities, expected at least one.")
+    wanted = tuple(o for o in OUTPUTS if outputs is None or o in outputs)
+    unknown = [o for o in outputs or () if o not in OUTPUTS]
+    if unknown:
+        raise InputError(f"dataset: output {unknown[0]!r}, expected some of {', '.join(OUTPUTS)}.")
+    if rays is None and outputs is not None and "coverage" in wanted:
+        raise InputError("dataset: coverage needs the rays of the training frames, expected them with it.")
+    wanted = tuple(o for o in wanted if o != "coverage" or rays is not None)
+    placed = [_place(field, names, camera, pose, rig) for camera, pose, _ in views]
+    if format == "mms-data":
+        _meta(field, out, names, placed)  # what it does not hold is said before anything is rendered
+    fit = {key: field.manifest.get(key) for key in ("recipe", "seed", "scene", "steps")}
+    request = {
+        "layout": LAYOUT,
+        "field": field_hash(field),
+        "fit": fit,
+        "rig": rig,
+        "format": format,
+        "outputs": list(wanted),
+        "modalities": {name: sensor_json(field.sensors[name]) for name in names},
+        "unit": field.unit,
+        "conventions": CONVENTIONS,
+        "versions": {"mmsynth": __version__} | {package: version(package) for package in ("numpy", "torch")},
+    }
+    stated = [
+        {"name": name, "cameras": {m: camera_json(c, p) for m, (c, p) in cameras.items()}}
+        for (_, _, name), cameras in zip(views, placed, strict=True)
+    ]
+    known = json.dumps(request, sort_keys=True)
+    seen_from = None if rays is None or "coverage" not in wanted else hashlib.sha256(rays.poses.tobytes()).hexdigest()
+    # the flow of a view depends on where the next one is
+    following = [view["cameras"] if "flow" in wanted else None for view in stated[1:]] + [None]
+    keys = [
+        hashlib.sha256(json.dumps([known, seen_from, view, after], sort_keys=True).encode()).hexdigest()
+        for view, after in zip(stated, following, strict=True)
+    ]
+    groups = [list(names)] if rig == "aligned" else [[name] for name in names]
+    return _Plan(field, out, rig, format, wanted, rays, request, groups, placed, stated, keys, {})
+
+
+def _place(field: Field, names: Sequence[str], camera: Camera, pose: np.ndarray, rig: str) -> Placed:
+    """Camera and pose of each modality at one view."""
+    if rig == "aligned":
+        return dict.fromkeys(names, (camera, pose))
+    reference = next(iter(field.sensors))
+    out = {}
+    for name in names:
+        if name == reference:
+            out[name] = (camera, pose)
+        elif name in field.rig and name in field.cameras:
+            out[name] = (field.cameras[name], pose @ field.rig[name])
+        else:
+            raise InputError(f"dataset: modality {name!r} has no known place on the rig of {reference!r}, expected --rig aligned.")
+    return out
+
+
+def _of(stem: str, modality: str, rig: str) -> str:
+    """File stem: on the native rig, one per modality."""
+    return stem if rig == "aligned" else f"{stem}_{modality}"
+
+
+def _render(plan: _Plan, index: int, progress: Callable[[int], None] | None, modalities: bool = True) -> list[Rendering]:
+    """Each group of modalities of a view, or its geometry alone."""
+    geometry = bool(plan.outputs)
+    return [
+        plan.field.render(*plan.placed[index][group[0]], group if modalities else [], geometry=geometry, progress=progress)
+        for group in plan.groups
+    ]
+
+
+def _following(
+    plan: _Plan, index: int, mine: bool, ahead: dict[int, list[Rendering]], progress: Callable[[int], None]
+) -> list[np.ndarray] | None:
+    """depth_ray of the next view, by group: rendered now and kept, where it is still to be made, else read from what was made."""
+    if "flow" not in plan.outputs or index + 1 == len(plan.placed):
+        return None
+    # folders of another process may go into a shard at any time
+    readable = "geometry" in plan.outputs and (mine or plan.format != "webdataset")
+    made = finished_view(plan.out, index + 1, plan.keys[index + 1]) if readable else None
+    if made is not None:
+        folder = plan.out / view_folder(index + 1)
+        return [read_record(folder, made["files"], _of("geometry", group[0], plan.rig))["depth_ray"] for group in plan.groups]
+    if mine and plan.finished(index + 1) is None:
+        ahead[index + 1] = _render(plan, index + 1, progress)
+        return [rendering.depth_ray for rendering in ahead[index + 1]]
+    return [rendering.depth_ray for rendering in _render(plan, index + 1, None, modalities=False)]
+
+
+def _write_view(plan: _Plan, index: int, renderings: Sequence[Rendering], following: Sequence[np.ndarray] | None) -> None:
+    """Write the files of one view. The sidecar goes first, so that it never vouches for new files, and comes last."""
+    folder = plan.out / view_folder(index)
+    (folder / "view.json").unlink(missing_ok=True)
+    files: dict[str, Any] = {}
+    scores = []
+    record_format = "npz" if plan.format in ("webdataset", "mms-data") else plan.format
+    units = UNITS | {"depth_z": plan.field.unit, "depth_ray": plan.field.unit}
+    for number, (group, rendering) in enumerate(zip(plan.groups, renderings, strict=True)):
+        camera, pose = plan.placed[index][group[0]]
+        for name in group:
+            files |= _write_modality(plan, index, name, rendering, record_format)
+        if "geometry" in plan.outputs:
+            arrays = _geometry_arrays(rendering, pose)
+            for name in group:
+                clipped = rendering.channels[name] >= min(plan.field.sensors[name].saturation, 1.0)
+                arrays[f"saturated_{name}"] = np.asarray(clipped.any(-1))
+            if "coverage" in plan.outputs and plan.rays is not None:
+                arrays["coverage"] = coverage(plan.rays, camera, pose, rendering.depth_ray, rendering.normal)
+                hit = arrays["coverage"][np.isfinite(arrays["coverage"])]
+                scores.append(float(hit.mean(dtype=np.float64)) if hit.size else 0.0)
+            files |= write_record(folder, _of("geometry", group[0], plan.rig), arrays, record_format, units)
+        if following is not None:
+            there = plan.placed[index + 1][group[0]]
+            flow, occluded = optical_flow(camera, pose, rendering.depth_ray, rendering.normal, *there, following[number])
+            files |= write_record(folder, _of("flow", group[0], plan.rig), {"flow": flow, "occluded": occluded}, record_format, units)
+        picture = folder / f"{_of('image', group[0], plan.rig)}.png"
+        write_png16(picture, preview_linear(plan.field.sensors[group[0]], rendering.channels[group[0]]))
+        shown = {"shape": [camera.height, camera.width, 3], "dtype": "uint16", "unit": "full scale"}
+        files[picture.name] = {
+            "record": picture.stem,
+            "sha256": sha256_of(picture),
+            "bytes": picture.stat().st_size,
+            "arrays": {"image": shown},
+        }
+    score = {"coverage_score": float(np.mean(scores))} if scores else {}
+    write_json(folder / "view.json", {"request": plan.keys[index], **plan.stated[index], **score, "files": files})
+
+
+def _write_modality(plan: _Plan, index: int, name: str, rendering: Rendering, format: str) -> dict[str, Any]:
+    sensor, folder = plan.field.sensors[name], plan.out / view_folder(index)
+    arrays = modality_arrays(rendering.channels[name], rendering.stokes.get(name))
+    if plan.format != "mms-data":
+        return write_record(folder, name, arrays, format, UNITS, sensor)
+    frame = write_record(plan.out / "modalities" / name, f"{index:04d}", {"data": arrays.pop("data")}, "tiff", UNITS, sensor)
+    files = {f"../../modalities/{name}/{file}": facts | {"record": name} for file, facts in frame.items()}
+    return files | write_record(folder, name, arrays, format, UNITS)
+
+
+def _geometry_arrays(rendering: Rendering, pose: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        "depth_z": rendering.depth_z,
+        "depth_ray": rendering.depth_ray,
+        "normal": rendering.normal,
+        "normal_camera": (rendering.normal @ pose[:3, :3]).astype(np.float32),
+        "opacity": rendering.opacity,
+        "mask": rendering.opacity > 0.5,
+        "valid": rendering.valid,
+    }
+
+
+def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
+    """Write what stands above the views, once all of them are there; raw: the meta_data.json of their raw frames, seed: of their noise."""
+    out, views = plan.out, []
+    shards: dict[str, dict[str, Any]] = {}
+    for index in range(len(plan.placed)):
+        # another process may have its views and not yet their shard
+        shard = plan.shard(index) if plan.format == "webdataset" else None
+        stated = shard[index % PER_SHARD] if shard else plan.finished(index) if plan.format != "webdataset" else None
+        if stated is None:
+            return None
+        where = {"folder": view_folder(index)}
+        if shard:
+            where = {"shard": shard_name(index), "key": f"{index:04d}"}
+            path = out / shard_name(index)
+            shards[shard_name(index)] = shards.get(shard_name(index)) or {"sha256": sha256_of(path), "bytes": path.stat().st_size}
+        views.append(where | {key: value for key, value in stated.items() if key != "request"})
+    files = []
+    for group in plan.groups if plan.format != "webdataset" else []:
+        poses = [cameras[group[0]] for cameras in plan.placed]
+        files.append(out / f"{_of('transforms', group[0], plan.rig)}.json")
+        write_json(files[-1], _transforms(poses, f"{_of('image', group[0], plan.rig)}.png"))
+    if plan.format == "mms-data":
+        files.append(out / "meta_data.json")
+        write_json(files[-1], _meta(plan.field, out, list(plan.request["modalities"]), plan.placed))
+    if raw is not None:
+        files += [raw, *(path for kind in ("modalities", "sensors", "sidecars") for path in sorted((raw.parent / kind).rglob("[!.]*.*")))]
+    listed = {str(path.relative_to(out)): {"sha256": sha256_of(path), "bytes": path.stat().st_size} for path in files}
+    write_json(
+        out / "dataset.json",
+        {**plan.request, "files": listed} | ({"raw_seed": seed} if raw else {}) | ({"shards": shards} if shards else {}) | {"views": views},
+    )
+    return out / "dataset.json"
+
+
+def _meta(field: Field, out: Path, names: Sequence[str], placed: Sequence[Placed]) -> dict[str, Any]:
+    """meta_data.json of a scene whose frames have all channels at every pixel."""
+    sensors = [replace(field.sensors[name], mosaic=None) for name in names]
+    frames = {name: [(i, f"{i:04d}.tiff", *cameras[name]) for i, cameras in enumerate(placed)] for name in names}
+    return meta_content(out, sensors, frames, field.region, field.unit)
+
+
+def _transforms(cameras: Sequence[tuple[Camera, np.ndarray]], picture: str) -> dict[str, Any]:
+    """nerfstudio's transforms.json: OpenGL axes, centre of the top-left pixel at (0.5, 0.5)."""
+    frames = []
+    for index, (camera, pose) in enumerate(cameras):
+        fisheye = camera.lens == "kannala_brandt"
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        frames.append({
+            "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
+            "file_path": f"views/{index:04d}/{picture}",
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx + 0.5,
+            "cy": camera.cy + 0.5,
+            **dict(zip(names, map(float, camera.coefficients), strict=True)),
+            "transform_matrix": (np.asarray(pose) @ OPENGL_TO_OPENCV).tolist(),
+        })  # fmt: skip
+    return {"camera_model": frames[0]["camera_model"] if frames else "OPENCV", "frames": frames}

@@ -1,0 +1,1 @@
+"""How good a field and its conversions are."""

@@ -1,0 +1,232 @@
+"""How good a conversion is: every method beside the baselines that need no field, on test views.
+
+Truth, in this order: noise-free light of the target at the source's own pose (``gt/aligned``), noise-free light at the target's own pose
+(``gt/<modality>``), else the target's raw test frame. In the last two the conversion is made as the target sensor.
+
+Baselines: ``field``, the rendering alone; ``linear``, the frame's values through one linear map, learned from the field's renderings of all
+training poses of the source (a colour matrix of the scene); ``nearest``, the nearest training frame of the target, carried over through
+the surface, and the field where that frame does not see it.
+
+Values are clipped to [0, 1]; PSNR, RMSE, SAM, Stokes and AoLP errors are over all pixels with a ray, ``psnr_region`` over those in the
+region of interest; ERGAS (of a ratio of 1) and SSIM are torchmetrics'. Without truth, raw photosites are compared: PSNR alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis, structural_similarity_index_measure
+
+from mmsynth.errors import InputError
+from mmsynth.operations.conversion.methods import METHODS, Converted, carried_through, chosen_method, convert_frame
+from mmsynth.operations.evaluation.evaluate import GroundTruth, psnr_from_mse, spectral_angle_deg
+from mmsynth.operations.output.progress import Progress
+from mmsynth.scene.images import load_frame
+from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
+from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.mosaic import channels_of, photosites_of
+from mmsynth.sensors.polarization import (
+    angle_of_linear_polarization,
+    aolp_difference,
+    degree_of_linear_polarization,
+    intensities_to_stokes,
+    stokes_to_intensities,
+)
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field
+
+_LEARNED_FROM = 8  # renderings for the linear map
+
+
+def evaluate_conversion(
+    field: Field, scene: Scene, source: str, target: str, views: Sequence[int] | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Score all methods and baselines of one pair.
+
+    Args:
+        views: view ids; None: the scene's test views. progress: called with (frames done, frames in all).
+    Returns:
+        ``{"source", "target", "truth": "aligned" | "own pose" | "raw", "views": [...], "auto": method, "seconds_per_frame",
+        "methods": {name: {"psnr", "psnr_region", "ssim", "rmse": [per channel], "sam", "ergas", "stokes_rmse", "dolp_rmse", "aolp_mae",
+        "physical"}}}``.
+    Raises:
+        InputError: unknown modality, or no frames of the source in these views.
+    """
+    source, target = canonical_modality(source), canonical_modality(target)
+    field.check_modalities([source, target])
+    frames = scene.frames_of(source, tuple(scene.split.test) if views is None else tuple(views))
+    if not frames:
+        raise InputError(f"{scene.root}: no frames of {source} in the test views, expected some to convert.")
+    truth = GroundTruth(scene)
+    aligned = source == "rgb" and all(target in truth.aligned(f.view) for f in frames)
+    matrix = _linear(field, scene, source, target)
+    totals: dict[str, list[dict[str, np.ndarray]]] = {}
+    kind, seconds = "aligned", 0.0
+    used = chosen_method("auto", field.sensors[source], field.sensors[target])
+    judged: list[int] = []
+    for done, frame in enumerate(frames, 1):
+        raw, _ = load_frame(field.sensors[source], frame)
+        own = None if aligned else next(iter(scene.frames_of(target, (frame.view,))), None)
+        if not aligned and own is None:
+            continue
+        seen_by = None if own is None else (own.camera, field.pose_of(own))
+        pose = field.pose_of(frame)
+        light, region, kind = _truth_of(truth, field.sensors[target], frame, own)
+        results: dict[str, np.ndarray] = {}
+        for method in METHODS[1:]:
+            began = time.perf_counter()
+            found = convert_frame(field, raw, frame.camera, pose, source, target, method, seen_by)
+            seconds += (time.perf_counter() - began) * (method == used)
+            results[method] = _values(found, field.sensors[target])
+        results["linear"] = _by_linear(field, raw, frame, pose, source, matrix, seen_by, results["field"])
+        results["nearest"] = _by_nearest(field, scene, target, seen_by or (frame.camera, pose), results["field"])
+        for name, values in results.items():
+            totals.setdefault(name, []).append(_errors(values, light, found.valid, region, field.sensors[target], kind))
+        judged.append(frame.view)
+        if progress is not None:
+            progress(done, len(frames))
+    if not judged:
+        raise InputError(f"{scene.root}: no frames of {target} in the views of {source} to judge by.")
+    return {
+        "source": source,
+        "target": target,
+        "truth": kind,
+        "views": judged,
+        "auto": used,
+        "methods": {name: _summary(rows) for name, rows in totals.items()},
+        "seconds_per_frame": seconds / len(judged),
+    }
+
+
+def _truth_of(truth: GroundTruth, target: Sensor, frame: Frame, own: Frame | None) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """Light (H, W, C), of polarization Stokes, or raw photosites; the region; what it is."""
+    if own is None:
+        shape = truth.geometry(frame.view) or {}
+        region = shape["in_roi"].astype(bool) if "in_roi" in shape else truth.region(frame)
+        return truth.aligned(frame.view)[target.name].astype(np.float64), region, "aligned"
+    light = truth.image(own)
+    if light is not None:
+        return light.astype(np.float64), truth.region(own), "own pose"
+    return load_frame(target, own)[0].astype(np.float64), truth.region(own), "raw"
+
+
+def _values(found: Converted, target: Sensor) -> np.ndarray:
+    return (found.stokes if target.is_polarization and found.stokes is not None else found.values).astype(np.float64)
+
+
+def _as_light(values: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Intensities → Stokes vectors, where the sensor is one for polarization."""
+    if sensor.polarizer_angles_deg is None:
+        return values
+    return intensities_to_stokes(torch.from_numpy(np.asarray(values, np.float64)), sensor.polarizer_angles_deg).numpy()
+
+
+def _linear(field: Field, scene: Scene, source: str, target: str) -> np.ndarray:
+    """(C + 1, K): least squares from the source's channels and 1 to the target's, in renderings of training poses."""
+    frames = scene.frames_of(source, scene.split.train)
+    chosen = frames[:: max(1, len(frames) // _LEARNED_FROM)]
+    xs, ys = [], []
+    for frame in chosen:
+        seen = field.render(frame.camera, field.pose_of(frame), list(dict.fromkeys((source, target))), geometry=False)
+        x = seen.channels[source][seen.valid].astype(np.float64)
+        xs.append(np.concatenate([x, np.ones((len(x), 1))], 1))
+        ys.append(_as_light(seen.channels[target][seen.valid].astype(np.float64), field.sensors[target]))
+    x, y = np.concatenate(xs), np.concatenate(ys)
+    return np.linalg.solve(x.T @ x + 1e-6 * len(x) * np.eye(x.shape[1]), x.T @ y)
+
+
+def _by_linear(
+    field: Field,
+    raw: np.ndarray,
+    frame: Frame,
+    pose: np.ndarray,
+    source: str,
+    matrix: np.ndarray,
+    seen_by: tuple[Camera, np.ndarray] | None,
+    otherwise: np.ndarray,
+) -> np.ndarray:
+    channels = channels_of(raw, field.sensors[source].mosaic).astype(np.float64)
+    values = np.concatenate([channels, np.ones((*channels.shape[:2], 1))], -1) @ matrix
+    if seen_by is None:
+        return np.asarray(values)
+    carried, visible = carried_through(field, values, (frame.camera, pose), seen_by)
+    return np.where(visible[..., None], carried, otherwise)
+
+
+def _by_nearest(field: Field, scene: Scene, target: str, seen_by: tuple[Camera, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
+    """The training frame whose camera stands nearest, carried over."""
+    pose = seen_by[1]
+    frames = scene.frames_of(target, scene.split.train)
+    if not frames:
+        return otherwise
+    nearest = min(frames, key=lambda f: float(np.linalg.norm(field.pose_of(f)[:3, 3] - pose[:3, 3])))
+    values = _as_light(channels_of(load_frame(field.sensors[target], nearest)[0], field.sensors[target].mosaic), field.sensors[target])
+    carried, visible = carried_through(field, values, (nearest.camera, field.pose_of(nearest)), seen_by)
+    return np.where(visible[..., None], carried, otherwise)
+
+
+def _errors(
+    values: np.ndarray, light: np.ndarray, valid: np.ndarray, region: np.ndarray | None, target: Sensor, kind: str
+) -> dict[str, np.ndarray]:
+    """Sums to be pooled over views, and means of those that are not pooled."""
+    values = np.where(valid[..., None], values, 0.0)
+    intensities = lambda s: stokes_to_intensities(torch.from_numpy(s), target.polarizer_angles_deg or ()).numpy()
+    seen = intensities(values) if target.is_polarization else values
+    if kind == "raw":
+        if target.mosaic is not None:
+            seen = photosites_of(seen, target.mosaic)
+        real = light if light.ndim == seen.ndim else light[..., None]
+    else:
+        real = intensities(light) if target.is_polarization else light
+    seen, real = np.clip(seen, 0.0, 1.0), np.clip(real, 0.0, 1.0)
+    square = (seen - real) ** 2
+    out = {"mse": square[valid]}
+    if region is not None:
+        out["mse_region"] = square[valid & region]
+    if kind == "raw":
+        return out
+    out["mse_channels"] = square[valid].reshape(-1, square.shape[-1])
+    both = [torch.from_numpy(np.where(valid[..., None], x, 0.0)).movedim(-1, 0)[None].float() for x in (seen, real)]
+    if min(valid.shape) >= 11:
+        out["ssim"] = np.array([float(structural_similarity_index_measure(both[0], both[1], data_range=1.0))])  # type: ignore[arg-type]
+    if target.is_polarization:
+        ours, true = (torch.from_numpy(x[valid]) for x in (values, light))
+        out["stokes"] = ((ours - true) ** 2).numpy().ravel()
+        out["dolp"] = ((degree_of_linear_polarization(ours) - degree_of_linear_polarization(true)) ** 2).numpy()
+        apart = aolp_difference(angle_of_linear_polarization(ours), angle_of_linear_polarization(true)).abs().numpy()
+        strength = true[:, 1:].norm(dim=1).numpy()
+        out["aolp"], out["aolp_weight"] = apart * strength, strength
+        out["physical"] = (ours[:, 1:].norm(dim=1) <= ours[:, 0] + 1e-6).double().numpy()
+    elif target.channel_count > 1:
+        out["sam"] = spectral_angle_deg(values[valid], light[valid])
+        out["ergas"] = np.array([float(error_relative_global_dimensionless_synthesis(both[0], both[1], ratio=1.0))])
+    return out
+
+
+def _summary(rows: Sequence[dict[str, np.ndarray]]) -> dict[str, Any]:
+    pooled = lambda key: np.concatenate([row[key] for row in rows]) if all(key in row for row in rows) else None
+    out: dict[str, Any] = {}
+    for key, name in (("mse", "psnr"), ("mse_region", "psnr_region")):
+        found = pooled(key)
+        if found is not None and found.size:
+            out[name] = psnr_from_mse(float(found.mean()))
+    channels = pooled("mse_channels")
+    if channels is not None:
+        out["rmse"] = np.sqrt(channels.mean(0)).tolist()
+    for key, name, root in (
+        ("ssim", "ssim", False), ("sam", "sam", False), ("ergas", "ergas", False), ("stokes", "stokes_rmse", True),
+        ("dolp", "dolp_rmse", True), ("physical", "physical", False),
+    ):  # fmt: skip
+        found = pooled(key)
+        if found is not None and np.isfinite(found).any():
+            mean = float(found[np.isfinite(found)].mean())
+            out[name] = mean**0.5 if root else mean
+    angle, weight = pooled("aolp"), pooled("aolp_weight")
+    if angle is not None and weight is not None and weight.sum() > 0:
+        out["aolp_mae"] = float(angle.sum() / weight.sum())
+    return out

@@ -1,0 +1,347 @@
+"""How good a field is: test views against the raw frames, and against the noise-free truth where a scene has it.
+
+Definitions (all values linear, peak 1.0 = full scale, so PSNR = -10 log10 MSE; MSE is pooled over the pixels of all test views, not
+averaged per view in dB):
+
+* ``psnr``: raw photosites with a valid lens ray. A sensor clips, so predictions are clipped to [0, 1] here.
+* ``psnr_foreground``: the same in the foreground. ``foreground_from``: "masks" (the scene's masks or alpha), "gt" (first hit in the
+  region), and only where there is neither "opacity" (the field's own > 0.5: a field must not choose its own exam, so it says so).
+* ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
+  mosaic per channel.
+* ``psnr_truth``, ``psnr_truth_full``: all channels at every pixel of the own pose against ``gt/<modality>``, in the region and
+  everywhere; both clipped to [0, 1], beyond which no frame could have taught the field anything.
+* ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
+* ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``dolp_rmse``; ``aolp_mae``:
+  circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
+  at the own pose.
+* geometry, at the RGB pose, in the region: ``depth_mae`` (z-depth, scene unit) and ``normal_mae_deg`` where both have a surface,
+  ``hit_rate``: the share of true surface pixels that hit one; ``chamfer_visible``: mean distance from the field's surface points to
+  the nearest true one and back, averaged, between the points that the test views see (a ground-truth mesh also has undersides
+  that no camera saw). Only for scenes in metres, as the truth is.
+
+What is undefined (no such truth, no pixel) is left out; there is no NaN in the result.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from skimage.metrics import structural_similarity
+
+from mmsynth.errors import InputError
+from mmsynth.operations.output.progress import Counter, Progress
+from mmsynth.scene.images import load_frame, read_native
+from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
+from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.mosaic import photosites_of
+from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field, Rendering
+
+_FOREGROUND_SOURCES = ("masks", "gt", "opacity")
+
+
+class _Mean:
+    """Running weighted mean; None when nothing was added."""
+
+    def __init__(self) -> None:
+        self.total = self.weight = 0.0
+
+    def add(self, values: np.ndarray, weights: np.ndarray | None = None) -> None:
+        values = np.asarray(values, dtype=np.float64)
+        w = np.ones_like(values) if weights is None else np.asarray(weights, dtype=np.float64)
+        good = np.isfinite(values) & np.isfinite(w)
+        self.total += float((values[good] * w[good]).sum())
+        self.weight += float(w[good].sum())
+
+    @property
+    def value(self) -> float | None:
+        return self.total / self.weight if self.weight > 0 else None
+
+
+class _Scores:
+    """Named means of one modality; which of them become dB or a root is decided once, at the end."""
+
+    def __init__(self) -> None:
+        self.means: dict[str, _Mean] = {}
+
+    def add(self, key: str, values: np.ndarray, weights: np.ndarray | None = None) -> None:
+        self.means.setdefault(key, _Mean()).add(values, weights)
+
+    def value(self, key: str) -> float | None:
+        mean = self.means[key].value if key in self.means else None
+        if mean is None:
+            return None
+        if key.startswith("psnr"):
+            return psnr_from_mse(mean)
+        return float(np.sqrt(mean)) if key.endswith("_rmse") else mean
+
+
+def psnr_from_mse(mse: float) -> float:
+    """dB for peak 1.0; an exact match counts as 1e-12 (120 dB), because JSON has no infinity."""
+    return float(-10.0 * np.log10(max(mse, 1e-12)))
+
+
+def ssim(a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float | None:
+    """Structural similarity of two single-channel images in [0, 1], mean over valid pixels away from the border.
+
+    Gaussian window of 11 pixels (sigma 1.5); images smaller than that get the largest odd uniform window, below 3 pixels: None.
+
+    Args:
+        a, b: (H, W). valid: (H, W) bool; b takes a's values elsewhere, so that no window sees a hole.
+    """
+    window = min(11, *a.shape)
+    window -= 1 - window % 2
+    if window < 3:
+        return None
+    b = np.where(valid, b, a)
+    options: dict[str, Any] = {"win_size": window}
+    if window == 11:
+        options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    similarity = structural_similarity(a.astype(np.float64), b.astype(np.float64), data_range=1.0, full=True, **options)[1]
+    pad = window // 2
+    inner = (slice(pad, a.shape[0] - pad), slice(pad, a.shape[1] - pad))
+    chosen = similarity[inner][valid[inner]]
+    return float(chosen.mean()) if chosen.size else None
+
+
+def raw_ssim(measured: np.ndarray, predicted: np.ndarray, valid: np.ndarray, sensor: Sensor) -> list[float]:
+    """SSIM of each mosaic sub-frame (or of each channel of a frame without mosaic)."""
+    if sensor.mosaic is None:
+        pairs = [(measured[..., c], predicted[..., c], valid) for c in range(measured.shape[-1])]
+    else:
+        rows, columns = sensor.mosaic.shape
+        parts = [(slice(i, None, rows), slice(j, None, columns)) for i in range(rows) for j in range(columns)]
+        pairs = [(measured[p], predicted[p], valid[p]) for p in parts]
+    found = (ssim(*pair) for pair in pairs)
+    return [value for value in found if value is not None]
+
+
+def spectral_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between spectra (..., C) in degrees, (...,); NaN where one is black.
+
+    2 atan2(|â - b̂|, |â + b̂|): exact for small angles, where arccos of a float32 dot product has lost everything.
+    """
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    lengths = [np.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a, b = (np.where(n > 0, x / n, np.nan) for x, n in zip((a, b), lengths, strict=True))
+    return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+class GroundTruth:
+    """The scene's ``gt`` folder; every method gives None where it has nothing."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.folder = scene.root / "gt"
+
+    def arrays(self, *parts: str) -> dict[str, np.ndarray] | None:
+        path = self.folder.joinpath(*parts)
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path) as loaded:
+                return {key: loaded[key] for key in loaded.files}
+        except Exception as error:  # zip, zlib and numpy each have their own exception for a damaged file
+            raise InputError(f"{path}: damaged ground truth, could not be read ({error}).") from error
+
+    def image(self, frame: Frame) -> np.ndarray | None:
+        """(H, W, C), or Stokes (H, W, 3), at the frame's own pose."""
+        found = self.arrays(frame.source_name or frame.sensor, f"{frame.view:04d}.npz")
+        return None if found is None or "data" not in found else found["data"].astype(np.float32)
+
+    def region(self, frame: Frame) -> np.ndarray | None:
+        found = self.arrays("masks", f"{frame.view:04d}_{frame.source_name or frame.sensor}.npz")
+        return None if found is None or "in_roi" not in found else found["in_roi"].astype(bool)
+
+    def geometry(self, view: int) -> dict[str, np.ndarray] | None:
+        return self.arrays("geometry", f"{view:04d}.npz")
+
+    def aligned(self, view: int) -> dict[str, np.ndarray]:
+        """By canonical modality name."""
+        found = self.arrays("aligned", f"{view:04d}.npz") or {}
+        return {canonical_modality(key): value.astype(np.float32) for key, value in found.items() if value.ndim == 3}
+
+
+def _checked(truth: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.ndarray | None:
+    """Truth or a mask of the wrong size or channel count is an error of the scene, not a score."""
+    if truth is not None and truth.shape != shape:
+        raise InputError(f"{what}: array of shape {truth.shape}, expected {shape}.")
+    return truth
+
+
+def _mask(frame: Frame) -> np.ndarray | None:
+    if frame.mask is None:
+        return None
+    mask = read_native(frame.mask)
+    mask = np.asarray(mask.any(-1) if mask.ndim == 3 else mask > 0)
+    return _checked(mask, (frame.camera.height, frame.camera.width), f"{frame.mask}")
+
+
+def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Rendering, region: np.ndarray | None) -> None:
+    """Against the frame as the sensor recorded it."""
+    measured, alpha = load_frame(sensor, frame)
+    channels = np.clip(np.nan_to_num(rendering.channels[sensor.name]), 0.0, 1.0)
+    if alpha is not None:
+        # what is transparent was never seen
+        measured = measured * alpha[..., None]
+    predicted = channels if sensor.mosaic is None else photosites_of(channels, sensor.mosaic)
+    squared = (predicted - measured) ** 2
+    drawn = _mask(frame)
+    if drawn is None and alpha is not None:
+        drawn = alpha > 0.5
+    foreground = {"masks": drawn, "gt": region, "opacity": rendering.opacity > 0.5}
+    scores.add("psnr", squared[rendering.valid])
+    for source, mask in foreground.items():
+        if mask is not None:
+            scores.add(f"psnr_foreground/{source}", squared[rendering.valid & mask])
+    scores.add("ssim", np.array(raw_ssim(np.clip(measured, 0.0, 1.0), predicted, rendering.valid, sensor)))
+
+
+def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
+    """All channels against noise-free light; truth (H, W, C), of a polarization sensor Stokes (H, W, 3)."""
+    if sensor.polarizer_angles_deg is not None:
+        truth = stokes_to_intensities(torch.from_numpy(truth), sensor.polarizer_angles_deg).numpy()
+    difference = np.clip(rendering.channels[sensor.name], 0.0, 1.0) - np.clip(truth, 0.0, 1.0)
+    scores.add(key, difference[where & rendering.valid] ** 2)
+
+
+def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
+    """What PSNR does not say: the spectrum's shape, the polarization state."""
+    where = where & rendering.valid
+    if sensor.is_polarization:
+        ours, real = (torch.from_numpy(s[where].astype(np.float64)) for s in (rendering.stokes[sensor.name], truth))
+        scores.add("stokes_rmse", ((ours - real) ** 2).numpy())
+        scores.add("dolp_rmse", ((degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)) ** 2).numpy())
+        error = aolp_difference(angle_of_linear_polarization(ours), angle_of_linear_polarization(real)).abs()
+        scores.add("aolp_mae", error.numpy(), real[:, 1:].norm(dim=1).numpy())
+    elif sensor.channel_count > 3:
+        scores.add("sam", spectral_angle_deg(rendering.channels[sensor.name][where], truth[where]))
+
+
+def _score_geometry(scores: _Scores, rendering: Rendering, truth: dict[str, np.ndarray], region: np.ndarray) -> None:
+    surface = region & (truth["depth_z"] > 0) & rendering.valid
+    both = surface & np.isfinite(rendering.depth_z)
+    scores.add("hit_rate", both[surface])
+    scores.add("depth_mae", np.abs(rendering.depth_z[both] - truth["depth_z"][both]))
+    if "normal" in truth:
+        a, b = rendering.normal[both].astype(np.float64), truth["normal"][both].astype(np.float64)
+        known = np.isfinite(a).all(-1) & (np.linalg.norm(b, axis=-1) > 0.5)
+        scores.add("normal_mae_deg", spectral_angle_deg(a[known], b[known]))
+
+
+def _surface_points(camera: Camera, pose: np.ndarray, depth_z: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """World points (N, 3) of the pixels ``where``."""
+    rays = ray_map(camera)[0][where]
+    in_camera = rays * (depth_z[where].astype(np.float64) / rays[:, 2])[:, None]
+    return in_camera @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> float | None:
+    """Mean nearest distance between two point clouds, both ways; None when one is empty."""
+    a, b = np.concatenate(ours), np.concatenate(true)
+    if not len(a) or not len(b):
+        return None
+    return float(0.5 * (cKDTree(b).query(a)[0].mean() + cKDTree(a).query(b)[0].mean()))
+
+
+def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, progress: Progress | None = None) -> dict[str, Any]:
+    """Score a field on test views (definitions: module docstring).
+
+    Args:
+        views: view ids; None: the scene's test views. progress: called with (rays done, rays in all).
+    Returns:
+        ``{"modalities": {name: {"psnr", "psnr_foreground", "foreground_from", "ssim", "psnr_truth", ...}}, "geometry": {...},
+        "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON.
+    Raises:
+        InputError: no frame of these views, or a file that cannot be read.
+    """
+    began = time.perf_counter()
+    chosen = tuple(scene.split.test) if views is None else tuple(views)
+    names = [name for name in field.sensors if name in scene.sensors]
+    frames = [frame for name in names for frame in scene.frames_of(name, chosen)]
+    missing = sorted(set(chosen) - {frame.view for frame in frames})
+    if not frames or (views is not None and missing):
+        what = f"view {missing[0]}" if missing else "test views"
+        raise InputError(f"{scene.root}: no frames of {what} for any of {', '.join(field.sensors)}, expected view ids of the scene.")
+    truth = GroundTruth(scene)
+    # the pose of gt/aligned and gt/geometry; their lengths are metres
+    at_rgb = [frame for frame in scene.frames_of("rgb", chosen) if truth.aligned(frame.view) or truth.geometry(frame.view)]
+    count = Counter(progress, sum(frame.camera.width * frame.camera.height for frame in (*frames, *at_rgb)))
+    scores = {name: _Scores() for name in names}
+    own_pose = {name: _Scores() for name in names}
+    geometry = _Scores()
+    ours: list[np.ndarray] = []
+    true: list[np.ndarray] = []
+    rays, seconds = 0, 0.0
+    for frame in frames:
+        sensor, mine = field.sensors[frame.sensor], scores[frame.sensor]
+        started = time.perf_counter()
+        rendering = field.render(frame.camera, field.pose_of(frame), [sensor.name], geometry=False, progress=count)
+        seconds += time.perf_counter() - started
+        rays += int(rendering.valid.sum())
+        size = rendering.valid.shape
+        region = _checked(truth.region(frame), size, f"gt/masks, {sensor.name} view {frame.view}")
+        _score_raw(mine, sensor, frame, rendering, region)
+        channels = 3 if sensor.is_polarization else sensor.channel_count
+        light = _checked(truth.image(frame), (*size, channels), f"gt, {sensor.name} view {frame.view}")
+        if light is not None:
+            everywhere = np.ones(size, bool)
+            _score_truth(mine, "psnr_truth_full", sensor, rendering, light, everywhere)
+            if region is not None:
+                _score_truth(mine, "psnr_truth", sensor, rendering, light, region)
+            _score_light(own_pose[sensor.name], sensor, rendering, light, everywhere if region is None else region)
+    for frame in at_rgb:
+        aligned = {name: light for name, light in truth.aligned(frame.view).items() if name in names}
+        shape = truth.geometry(frame.view) or {}
+        started = time.perf_counter()
+        rendering = field.render(frame.camera, field.pose_of(frame), list(aligned), geometry=bool(shape), progress=count)
+        seconds += time.perf_counter() - started
+        rays += int(rendering.valid.sum())
+        size = rendering.valid.shape
+        region = shape["in_roi"].astype(bool) if "in_roi" in shape else truth.region(frame)
+        region = _checked(region, size, f"gt region, view {frame.view}")
+        where = np.ones(size, bool) if region is None else region
+        for name, light in aligned.items():
+            sensor = field.sensors[name]
+            _checked(light, (*size, 3 if sensor.is_polarization else sensor.channel_count), f"gt/aligned, {name} view {frame.view}")
+            _score_truth(scores[name], "psnr_aligned", sensor, rendering, light, where)
+            _score_light(scores[name], sensor, rendering, light, where)
+        if "depth_z" in shape and scene.unit == "m":
+            _score_geometry(geometry, rendering, shape, where)
+            surface = where & rendering.valid
+            ours.append(_surface_points(frame.camera, field.pose_of(frame), rendering.depth_z, surface & np.isfinite(rendering.depth_z)))
+            true.append(_surface_points(frame.camera, field.pose_of(frame), shape["depth_z"], surface & (shape["depth_z"] > 0)))
+    shape_scores = _values(geometry, ("depth_mae", "normal_mae_deg", "hit_rate"))
+    chamfer = _chamfer(ours, true) if ours else None
+    return {
+        "modalities": {name: _summary(scores[name], own_pose[name]) for name in names if scores[name].means},
+        "geometry": shape_scores | ({} if chamfer is None else {"chamfer_visible": chamfer}),
+        "views": sorted({frame.view for frame in frames}),
+        "seconds": {"render": seconds, "total": time.perf_counter() - began},
+        "rays_per_s": rays / max(seconds, 1e-9),
+    }
+
+
+def _values(scores: _Scores, keys: Sequence[str]) -> dict[str, Any]:
+    found = {key: scores.value(key) for key in keys}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
+    """The keys of one modality in the order of the module docstring."""
+    out = _values(scores, ("psnr",))
+    for source in _FOREGROUND_SOURCES:
+        value = scores.value(f"psnr_foreground/{source}")
+        if value is not None:
+            out |= {"psnr_foreground": value, "foreground_from": source}
+            break
+    out |= _values(scores, ("ssim", "psnr_truth", "psnr_truth_full", "psnr_aligned"))
+    light = ("sam", "stokes_rmse", "dolp_rmse", "aolp_mae")
+    return out | (_values(scores, light) or _values(own_pose, light))

@@ -1,0 +1,4 @@
+"""The surface as a mesh, with every modality on it.
+
+Start with ``extract``.
+"""

@@ -1,0 +1,225 @@
+"""Named arrays of one picture as files, and back: npz, OpenEXR or TIFF; and what their sidecars say of cameras, sensors and conventions.
+
+A *record* is what belongs together: a modality (``data`` (H, W, C), for polarization also ``stokes`` (H, W, 3)), the geometry of a view.
+
+* npz: one file, every array as it is; channel names, wavelengths_nm (NaN = none) and polarizer_angles_deg beside the data.
+* exr: one file of float channels. Data are named as in the spectral layout of Fichet, Pacanowski and Wilkie ("An OpenEXR Layout for
+  Spectral Images", JCGT 2021): ``S0.692,000000nm`` where a channel has a wavelength, its own name elsewhere; a Stokes vector is ``S0``,
+  ``S1``, ``S2``. Sensors that are neither RGB nor have one channel also get ``R``, ``G``, ``B`` in half precision, for viewers.
+* tiff: one file an array; data 16-bit (clipped to [0, 1]) as STEM.tiff, all others float as STEM_KEY.tiff.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.files import sha256_of
+from mmsynth.operations.output.previews import preview_linear
+from mmsynth.scene.images import read_exr, read_native, write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.scene import Sensor
+from mmsynth.sensors.camera import Camera
+
+if TYPE_CHECKING:
+    from mmsynth.field.field import Field
+
+FORMATS = ("npz", "exr", "tiff")
+UNITS = {"data": "full scale", "stokes": "full scale", "raw": "full scale", "flow": "px"}
+
+CONVENTIONS = {
+    "camera_axes": "OpenCV: x right, y down, z forward; camera_to_world 4x4",
+    "pixels": "centre of the top-left pixel is (0, 0)",
+    "distortion": "OpenCV's: lens brown_conrady k1 k2 p1 p2 k3 k4 k5 k6, kannala_brandt (fisheye) k1 k2 k3 k4, undistorted to distorted; "
+    "images are distorted, as the lens sees",
+    "radiance": "linear float32, 1.0 = full scale of the sensor; NaN where the lens has no ray",
+    "polarization": "S0 S1 S2 about the camera x axis; angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
+    "depth": "depth_z along the optical axis, depth_ray along the ray; NaN = no hit",
+    "normal": "world frame, unit, outward; normal_camera the same in the camera's axes; NaN = no hit",
+    "world": "the scene's own frame and unit",
+}
+
+_PARTS = {
+    "stokes": ("S0", "S1", "S2"),
+    "normal": ("N.X", "N.Y", "N.Z"),
+    "normal_camera": ("NC.X", "NC.Y", "NC.Z"),
+    "flow": ("flow.U", "flow.V"),
+}
+
+
+def camera_json(camera: Camera, camera_to_world: np.ndarray) -> dict[str, Any]:
+    """Intrinsics, lens and pose in the library's conventions, ready for JSON."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "lens": camera.lens,
+        "distortion": list(camera.distortion),
+        "camera_to_world": np.asarray(camera_to_world, dtype=np.float64).tolist(),
+    }
+
+
+def camera_from_json(stated: Mapping[str, Any]) -> tuple[Camera, np.ndarray]:
+    """Camera and (4, 4) pose that ``camera_json`` wrote."""
+    numbers = {key: value for key, value in stated.items() if key not in ("camera_to_world", "distortion")}
+    return Camera(**numbers, distortion=tuple(stated["distortion"])), np.array(stated["camera_to_world"], dtype=np.float64)
+
+
+def field_hash(field: Field) -> str:
+    """SHA-256 over the parameters and the rendering settings: two fields with one hash render the same."""
+    digest = hashlib.sha256(repr(getattr(field, "sampling", None)).encode())
+    for name, tensor in sorted(field.state_dict().items()):
+        value = tensor.detach().cpu().contiguous().numpy()
+        digest.update(f"{name} {value.dtype} {value.shape}".encode())
+        digest.update(value.tobytes())
+    return digest.hexdigest()
+
+
+def sensor_json(sensor: Sensor) -> dict[str, Any]:
+    """Channel names, wavelengths and analyser angles of a sensor, ready for JSON."""
+    return {
+        "channels": list(sensor.channels),
+        "wavelengths_nm": list(sensor.wavelengths_nm),
+        "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
+    }
+
+
+def modality_arrays(values: np.ndarray, stokes: np.ndarray | None) -> dict[str, np.ndarray]:
+    """The record of one modality: data (H, W, C) float32 and, for polarization, stokes (H, W, 3)."""
+    return {"data": values.astype(np.float32)} | ({} if stokes is None else {"stokes": stokes.astype(np.float32)})
+
+
+def write_record(
+    folder: Path, stem: str, arrays: Mapping[str, np.ndarray], format: str, units: Mapping[str, str], sensor: Sensor | None = None
+) -> dict[str, dict[str, Any]]:
+    """Write a record.
+
+    Args:
+        arrays: (H, W) or (H, W, K) by name. units: of the arrays, by name; those not in it are pure numbers. sensor: of ``data``.
+    Returns:
+        per file name: record, sha256, bytes, and per array shape, dtype, unit and, in exr, the names of its channels; channel names,
+        wavelengths and analyser angles of ``data``.
+    Raises:
+        InputError: the disk refused.
+    """
+    facts = {} if sensor is None else sensor_json(sensor)
+
+    def entry(path: Path, keys: Mapping[str, str], channels: Mapping[str, list[str]] | None = None) -> dict[str, Any]:
+        described = {
+            key: {"shape": list(arrays[key].shape), "dtype": dtype, "unit": units.get(key, "1")}
+            | ({} if channels is None else {"channels": channels[key]})
+            for key, dtype in keys.items()
+        }
+        about = facts if "data" in keys else {}
+        return {"record": stem, "sha256": sha256_of(path), "bytes": path.stat().st_size, "arrays": described, **about}
+
+    own = {key: str(array.dtype) for key, array in arrays.items()}
+    if format == "npz":
+        path = folder / f"{stem}.npz"
+        write_npz(path, {**arrays, **_labels_of(sensor)})
+        return {path.name: entry(path, own)}
+    if format == "exr":
+        path = folder / f"{stem}.exr"
+        named = {key: _names(key, array, sensor) for key, array in arrays.items()}
+        channels = {name: plane for key, array in arrays.items() for name, plane in zip(named[key], _planes(array), strict=True)}
+        write_exr(path, {**channels, **_viewable(arrays, sensor)}, _LAYOUT if sensor is not None else {})
+        return {path.name: entry(path, own, named)}
+    out = {}
+    for key, array in arrays.items():
+        path = folder / (f"{stem}.tiff" if key == "data" else f"{stem}_{key}.tiff")
+        if key == "data":
+            write_tiff16(path, array)
+        else:
+            write_tiff(path, array.astype(np.float32))
+        out[path.name] = entry(path, {key: "uint16" if key == "data" else own[key]})
+    return out
+
+
+def read_record(folder: Path, files: Mapping[str, Mapping[str, Any]], record: str) -> dict[str, np.ndarray]:
+    """The arrays of a record as they were written; 16-bit data come back as float32 in [0, 1].
+
+    Args:
+        files: what ``write_record`` returned, of one or more records.
+    Raises:
+        InputError: a file or an array of it is missing or damaged, or there is no such record.
+    """
+    out: dict[str, np.ndarray] = {}
+    for name, stated in files.items():
+        if stated.get("record") != record:
+            continue
+        path = folder / name
+        planes = read_npz(path) if path.suffix == ".npz" else read_exr(path) if path.suffix == ".exr" else {}
+        for key, facts in stated["arrays"].items():
+            names = facts.get("channels", [key])
+            if planes and any(channel not in planes for channel in names):
+                raise InputError(f"{path}: no '{key}' in it, expected {', '.join(names)}.")
+            if not planes:
+                array = read_native(path)
+            else:
+                array = planes[key] if "channels" not in facts else np.stack([planes[n] for n in names], -1)
+            array = array.reshape(facts["shape"])
+            # 16 bits are the share of full scale
+            out[key] = array / np.float32(65535) if facts["dtype"] == "uint16" else array.astype(facts["dtype"])
+    if not out:
+        raise InputError(f"{folder}: no record '{record}', expected one of {', '.join(sorted({f['record'] for f in files.values()}))}.")
+    return out
+
+
+_LAYOUT = {"spectralLayoutVersion": "1.0", "emissiveUnits": "DN (1 = full scale)", "polarisationHandedness": "right"}
+
+
+def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndarray]:
+    """All arrays of an npz file; name: for errors.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    try:
+        with np.load(file) as arrays:
+            return {key: arrays[key] for key in arrays.files}
+    except Exception as error:  # zipfile, zlib and numpy each have their own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{name or file}: damaged or missing, could not be read ({reason}).") from error
+
+
+def _labels_of(sensor: Sensor | None) -> dict[str, np.ndarray]:
+    """What an npz file says of its data."""
+    if sensor is None:
+        return {}
+    waves = np.array([np.nan if w is None else w for w in sensor.wavelengths_nm], np.float32)
+    out = {"channels": np.array(sensor.channels, dtype=np.str_), "wavelengths_nm": waves}
+    if sensor.polarizer_angles_deg is not None:
+        out["polarizer_angles_deg"] = np.array(sensor.polarizer_angles_deg, np.float32)
+    return out
+
+
+def _planes(array: np.ndarray) -> list[np.ndarray]:
+    return [array] if array.ndim == 2 else [array[..., i] for i in range(array.shape[2])]
+
+
+def _names(key: str, array: np.ndarray, sensor: Sensor | None) -> list[str]:
+    """Names of an array's channels in an EXR file; a dot opens a layer."""
+    if array.ndim == 2:
+        return [{"depth_z": "Z"}.get(key, key)]
+    if key != "data" or sensor is None:
+        return [*_PARTS.get(key, [f"{key}.{i}" for i in range(array.shape[2])])]
+    plain = [name.replace(".", "_") or f"channel{i}" for i, name in enumerate(sensor.channels)]
+    plain = [f"I{name}" for name in plain] if sensor.is_polarization else plain
+    waves = [None] * len(plain) if sensor.is_polarization else sensor.wavelengths_nm
+    names = [label if w is None else f"S0.{f'{w:.6f}'.replace('.', ',')}nm" for label, w in zip(plain, waves, strict=True)]
+    return names if len(set(names)) == len(names) else [f"{i}_{label}" for i, label in enumerate(plain)]
+
+
+def _viewable(arrays: Mapping[str, np.ndarray], sensor: Sensor | None) -> dict[str, np.ndarray]:
+    """R, G and B for a viewer that knows nothing else; where the data are not that already."""
+    if sensor is None or sensor.channel_count == 1 or {"R", "G", "B"} & set(sensor.channels):
+        return {}
+    shown = preview_linear(sensor, arrays["data"]).astype(np.float16)
+    return {label: shown[..., i] for i, label in enumerate("RGB")}

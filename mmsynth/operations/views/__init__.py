@@ -1,0 +1,1 @@
+"""Where to look from, and what can be seen from there."""

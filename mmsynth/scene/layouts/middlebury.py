@@ -1,0 +1,103 @@
+"""Middlebury multi-view scenes: images and ``*_par.txt`` with one line ``name K R t`` per image, P = K [R t].
+
+``[R t]`` is world to camera in OpenCV axes, and the origin is the top-left pixel. The tight bounding box in ``README.txt``
+gives the region of interest (the ball around it); without it the cameras do. The id of a view is its line's position.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.scene.images import read_native
+from mmsynth.scene.layouts.mmsdata import make_sensor, wanted_modalities
+from mmsynth.scene.poses import make_camera, region_from_cameras, rigid, text_lines
+from mmsynth.scene.scene import Frame, Region, Scene, make_split
+
+
+def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scene:
+    """Read a Middlebury scene; images that are listed and missing are left out.
+
+    Args:
+        root: folder with the images and one ``*_par.txt``.
+        modalities: names or aliases to read; None: all (there is one: rgb, or mono for grey images).
+    Raises:
+        InputError: wrong line, skew in K, pose that is not finite and rigid, or no image at all.
+    """
+    root = Path(root)
+    files = sorted(root.glob("*_par.txt"))
+    if len(files) != 1:
+        raise InputError(f"{root}: {len(files)} files match *_par.txt, expected one.")
+    path = files[0]
+    found: list[tuple[int, Path, np.ndarray, np.ndarray]] = []
+    missing = 0
+    lines = [(row, line.split()) for row, line in enumerate(text_lines(path), 1) if line.strip()]
+    lines = lines[1:] if lines and len(lines[0][1]) == 1 else lines  # the count of images
+    for view, (row, tokens) in enumerate(lines):
+        where = f"{path}: line {row}"
+        matrix, pose = _parse(tokens, where)
+        if (root / tokens[0]).is_file():
+            found.append((view, root / tokens[0], matrix, pose))
+        else:
+            missing += 1
+    if not found:
+        raise InputError(f"{path}: none of the {missing} images listed is in {root}.")
+    first = read_native(found[0][1])
+    name = "mono" if first.ndim == 2 else "rgb"
+    wanted_modalities([name], modalities, path)
+    height, width = first.shape[:2]
+    frames = tuple(
+        Frame(name, view, image, make_camera(f"{path}: view {view}", width, height, *_focal_and_centre(k), ()), pose, name)
+        for view, image, k, pose in found
+    )
+    region = _stated_region(root) or region_from_cameras([f.camera for f in frames], [f.camera_to_world for f in frames])
+    problems = (f"{missing} of {missing + len(found)} frames have no image file and are left out.",) if missing else ()
+    sensors = {name: make_sensor(name, {}, str(path), first, raw=False)}
+    return Scene(root, "Middlebury", sensors, frames, region, make_split(f.view for f in frames), problems=problems)
+
+
+def _parse(tokens: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
+    """K (3, 3) with K[2, 2] = 1, and camera_to_world (4, 4)."""
+    try:
+        values = np.array([float(token) for token in tokens[1:]])
+    except ValueError as error:
+        raise InputError(f"{where}: not a number, expected 'name' and the 21 numbers of K, R and t.") from error
+    if values.shape != (21,) or not np.isfinite(values).all():
+        raise InputError(f"{where}: {len(values)} numbers or one not finite, expected 'name' and the 21 finite numbers of K, R and t.")
+    matrix = values[:9].reshape(3, 3)
+    if matrix[2, 2] <= 0 or np.abs(matrix[[1, 2, 2], [0, 0, 1]]).max() > 0:
+        raise InputError(f"{where}: K is not upper triangular with a positive last entry.")
+    matrix = matrix / matrix[2, 2]
+    if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
+        raise InputError(f"{where}: K has the skew {matrix[0, 1]:g}, expected 0: cameras with skew are not supported.")
+    world_to_camera = rigid(np.column_stack([values[9:18].reshape(3, 3), values[18:]]), where)
+    camera_to_world = np.eye(4)
+    camera_to_world[:3, :3] = world_to_camera[:3, :3].T
+    camera_to_world[:3, 3] = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+    return matrix, camera_to_world
+
+
+def _focal_and_centre(matrix: np.ndarray) -> tuple[float, float, float, float]:
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+
+
+def _stated_region(root: Path) -> Region | None:
+    """The ball around the bounding box in README.txt: two lines '(x y z)', the corners."""
+    path = root / "README.txt"
+    if not path.is_file():
+        return None
+    triple = r"\(\s*([-+.\deE]+)[\s,]+([-+.\deE]+)[\s,]+([-+.\deE]+)\s*\)"
+    match = re.search(triple + r"\s+" + triple, path.read_text(encoding="utf-8", errors="replace"))
+    if match is None:
+        return None
+    try:
+        corners = np.array([float(value) for value in match.groups()]).reshape(2, 3)
+    except ValueError:
+        return None
+    radius = float(np.linalg.norm(corners[1] - corners[0]) / 2)
+    x, y, z = corners.mean(0)
+    return Region((float(x), float(y), float(z)), radius) if radius > 0 else None

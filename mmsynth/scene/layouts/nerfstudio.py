@@ -1,0 +1,173 @@
+"""nerfstudio and instant-ngp scenes: ``transforms.json`` and image files.
+
+* ``transform_matrix`` is camera-to-world in OpenGL axes; principal points have the top-left pixel's centre at 0.5.
+* The id of a view is the frame's ``view`` key, else its position in the list (frames without an image count too, so ids
+  do not depend on what was downloaded).
+* Test views: ``test_filenames`` (or all but ``train_filenames``), else ``test_ids``, else every tenth.
+* One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
+  says which, and the optional top-level object ``modalities`` describes them with the keys of ``mmsdata.make_sensor``.
+* The region of interest is not in the file: see ``poses.region_from_cameras``, and ``region_from_points`` for files with the sparse
+  points of ``ply_file_path`` and for pictures with calibration boards.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmsynth.errors import InputError
+from mmsynth.files import read_json
+from mmsynth.scene.capture.boards import board_points
+from mmsynth.scene.images import SUFFIXES, read_native
+from mmsynth.scene.layouts.mmsdata import make_sensor, wanted_modalities
+from mmsynth.scene.poses import OPENGL_TO_OPENCV, entries, region_from_cameras, region_from_points, rigid, transforms_camera, whole
+from mmsynth.scene.scene import Frame, Scene, Sensor, Split, canonical_modality, make_split
+
+
+def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scene:
+    """Read a nerfstudio or instant-ngp scene.
+
+    Args:
+        path: the folder with ``transforms.json``, or the JSON file itself.
+        modalities: names or aliases to read; None: all.
+    Raises:
+        InputError: wrong key, unknown lens model, pose that is not finite and rigid, or no image at all.
+    """
+    path = Path(path)
+    path = path / "transforms.json" if path.is_dir() else path
+    root = path.parent
+    meta = read_json(path)
+    if not isinstance(meta, dict):
+        raise InputError(f"{path}: a JSON {type(meta).__name__}, expected an object with the key 'frames'.")
+    listed = entries(meta, "frames", path)
+    images = [_image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)]
+    present = [index for index, image in enumerate(images) if image is not None]
+    if not present:
+        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
+    problems = []
+    if len(present) < len(listed):
+        problems.append(f"{len(listed) - len(present)} of {len(listed)} frames have no image file and are left out.")
+    for source in dict.fromkeys(str(frame.get("modality", "")) for frame in listed):
+        if not any(str(listed[index].get("modality", "")) == source for index in present):
+            problems.append(f"{source or 'the default modality'}: none of its frames has an image file, it is left out.")
+
+    first: dict[str, np.ndarray] = {}  # by modality as the file spells it: the first image, for size and channels
+    for index in present:
+        source = str(listed[index].get("modality", ""))
+        if source not in first:
+            first[source] = read_native(_known(images[index]))
+    names = {source: canonical_modality(source) if source else _default_modality(image) for source, image in first.items()}
+    wanted = wanted_modalities(dict.fromkeys(names.values()), modalities, path)
+    described = _described(meta, path)
+    sensors: dict[str, Sensor] = {}
+    for source, image in first.items():
+        if names[source] in wanted and names[source] not in sensors:
+            entry = described.get(names[source], {})
+            sensors[names[source]] = make_sensor(names[source], entry, str(path), image, raw="mosaick_pattern" in entry)
+
+    frames: list[Frame] = []
+    positions: dict[str, int] = {}
+    for index, (frame, found) in enumerate(zip(listed, images, strict=True)):
+        source = str(frame.get("modality", ""))
+        where = f"{path}: frame {index} ({frame['file_path']})"
+        position = positions.get(source, 0)
+        positions[source] = position + 1
+        pose = rigid(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
+        if found is None or names[source] not in wanted:
+            continue
+        camera = transforms_camera(meta, frame, where, (first[source].shape[1], first[source].shape[0]))
+        if camera is None:
+            raise InputError(f"{where}: no focal length, expected 'fl_x' or 'camera_angle_x' in the frame or the file.")
+        view = whole(frame, "view", where) if "view" in frame else position
+        mask = root / str(frame["mask_path"]) if "mask_path" in frame else None
+        frames.append(Frame(names[source], view, found, camera, pose, source, mask if mask is not None and mask.is_file() else None))
+    order = list(sensors)
+    frames.sort(key=lambda frame: (order.index(frame.sensor), frame.view))
+    for one, two in itertools.pairwise(frames):
+        if (one.sensor, one.view) == (two.sensor, two.view):
+            raise InputError(f"{path}: view {one.view} of '{one.sensor}' is listed twice, expected every view once.")
+    alpha = any(_has_alpha(image, sensors[names[source]]) for source, image in first.items() if names[source] in sensors)
+    region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
+    stands = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
+    if "ply_file_path" in meta:
+        points = _sparse_points(root / str(meta["ply_file_path"]))
+        if points is None:
+            problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
+        else:
+            region = region_from_points(points, region, stands)
+    else:
+        plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
+        region = region_from_points(board_points(plain), region, stands) if plain else region
+    split = _split(meta, frames, path)
+    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
+
+
+def _sparse_points(path: Path) -> np.ndarray | None:
+    """(N, 3) finite points of a PLY file; None where there are none."""
+    import trimesh  # takes its time
+
+    try:
+        points = np.asarray(getattr(trimesh.load(path), "vertices", ()), dtype=np.float64)
+    except (OSError, ValueError, KeyError, IndexError):
+        return None
+    points = points[np.isfinite(points).all(1)] if points.ndim == 2 and points.shape[1] == 3 else points[:0]
+    return points if len(points) else None
+
+
+def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None:
+    """The frame's image; a ``file_path`` without a known extension is tried with each of them."""
+    if not isinstance(frame.get("file_path"), str):
+        raise InputError(f"{where}: key 'file_path' is {frame.get('file_path', 'missing')!r}, expected the name of an image file.")
+    path = root / frame["file_path"]
+    # appended, not replaced: "0001.rgb" is a name without extension
+    candidates = [path] if path.suffix.lower() in SUFFIXES else [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _known(path: Path | None) -> Path:
+    assert path is not None
+    return path
+
+
+def _default_modality(image: np.ndarray) -> str:
+    return "mono" if image.ndim == 2 or image.shape[2] == 2 else "rgb"
+
+
+def _described(meta: Mapping[str, Any], path: Path) -> dict[str, Mapping[str, Any]]:
+    given = meta.get("modalities", {})
+    if not isinstance(given, dict) or not all(isinstance(entry, dict) for entry in given.values()):
+        raise InputError(f"{path}: key 'modalities' is not an object of objects.")
+    return {canonical_modality(name): entry for name, entry in given.items()}
+
+
+def _has_alpha(image: np.ndarray, sensor: Sensor) -> bool:
+    return sensor.mosaic is None and image.ndim == 3 and image.shape[2] > sensor.channel_count
+
+
+def _split(meta: Mapping[str, Any], frames: Sequence[Frame], path: Path) -> Split:
+    views = [frame.view for frame in frames]
+    by_name = {str(_without_suffix(frame.path)): frame.view for frame in frames}
+    test, train = _names(meta, "test_filenames", path), _names(meta, "train_filenames", path)
+    if test:
+        return make_split(views, (view for name, view in by_name.items() if name in test), "test_filenames")
+    if train:
+        return make_split(views, (view for name, view in by_name.items() if name not in train), "train_filenames")
+    ids = meta.get("test_ids", [])
+    if not isinstance(ids, list) or not all(isinstance(view, int) for view in ids):
+        raise InputError(f"{path}: key 'test_ids' is not a list of view ids.")
+    return make_split(views, ids, "test_ids")
+
+
+def _names(meta: Mapping[str, Any], key: str, path: Path) -> set[str]:
+    given = meta.get(key, [])
+    if not isinstance(given, list):
+        raise InputError(f"{path}: key '{key}' is not a list of file names.")
+    return {str(_without_suffix(path.parent / str(name))) for name in given}
+
+
+def _without_suffix(path: Path) -> Path:
+    return path.with_suffix("") if path.suffix.lower() in SUFFIXES else path

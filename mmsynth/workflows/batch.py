@@ -1,0 +1,114 @@
+"""Many scenes, one after the other: a fit and a dataset of each. One that fails does not stop the rest."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mmsynth.errors import InputError
+from mmsynth.field.field import Field
+from mmsynth.files import write_json
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.trainer import fit
+from mmsynth.operations.dataset.generate import generate_dataset
+from mmsynth.operations.output.work_partition import Share, local_device
+from mmsynth.operations.views.trajectories import load_views
+from mmsynth.report.report import write_report
+from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is made of every scene.
+
+    Attributes:
+        recipe: of the fits. steps, seconds: their length, one of the two or neither (the recipe's). modalities: names, None: all.
+        poses: for ``load_views``, None: no datasets; a file that is not there is sought in each scene's folder. rig, format: of the
+            datasets.
+    """
+
+    recipe: Recipe
+    steps: int | None = None
+    seconds: float | None = None
+    seed: int = 0
+    device: str = "cpu"
+    modalities: tuple[str, ...] | None = None
+    poses: Path | None = None
+    rig: str = "aligned"
+    format: str = "npz"
+
+
+def read_scene_list(path: Path) -> list[Path]:
+    """Scene folders of a text file, one a line, # for comments; those that are not there as given are sought beside the file.
+
+    Raises:
+        InputError: unreadable, no scene in it, or two scenes whose folders have one name.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: could not be read ({error}).") from error
+    named = [text for line in lines if (text := line.split("#")[0].strip())]
+    if not named:
+        raise InputError(f"{path}: no scene in it, expected one folder a line.")
+    scenes = [Path(text) if Path(text).exists() else path.parent / text for text in named]
+    names = [scene.resolve().name for scene in scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{path}: two scenes are called '{name}', expected folders whose names differ: results go into OUT/{name}.")
+    return scenes
+
+
+def run_batch(
+    scenes: Sequence[Path], out: Path, job: Job, share: Share | None = None, say: Callable[[str], None] = lambda text: None
+) -> dict[str, dict[str, Any]]:
+    """Fit every scene and make its dataset, into ``<out>/NAME/run`` and ``<out>/NAME/dataset``; NAME/outcome.json says how it went.
+
+    What is finished is not made again, what was cut off goes on.
+
+    Args:
+        share: the scenes of this process, None: all. say: told a line per scene.
+    Returns:
+        by name, what outcome.json holds: "run", "dataset", "seconds", "train_psnr", or "error", the sentence of the scene that failed.
+    """
+    outcomes = {}
+    for index in (share or Share()).of(len(scenes)):
+        scene, name = scenes[index], scenes[index].resolve().name
+        began = time.perf_counter()
+        try:
+            outcome = _one(scene, out / name, job)
+            shown = ", ".join(f"{n} {v:.1f}" for n, v in outcome["train_psnr"].items())
+            say(f"{name}: {shown} dB on training pixels, {time.perf_counter() - began:.0f} s")
+        except InputError as error:
+            outcome = {"error": str(error)}
+        except Exception as error:  # one scene must not take the others down, whatever it is
+            outcome = {"error": f"{scene}: {type(error).__name__}: {error}"}
+        if "error" in outcome:
+            say(f"{name}: failed: {outcome['error']}")
+        outcomes[name] = {"scene": str(scene), "seconds": time.perf_counter() - began, **outcome}
+        write_json(out / name / "outcome.json", outcomes[name])
+    return outcomes
+
+
+def _one(path: Path, out: Path, job: Job) -> dict[str, Any]:
+    scene = load_scene(path, job.modalities)
+    run = out / "run"
+    field = _fitted(scene, run, job)
+    made = None
+    if job.poses is not None:
+        poses = job.poses if job.poses.exists() else scene.root / job.poses
+        made = generate_dataset(field, load_views(poses, field, scene), out / "dataset", rig=job.rig, format=job.format)
+    return {"run": str(run), "dataset": None if made is None else str(made), "train_psnr": field.manifest["train_psnr"]}
+
+
+def _fitted(scene: Scene, run: Path, job: Job) -> Field:
+    if (run / "manifest.json").is_file():
+        return Field.load(run, local_device(job.device))
+    resume = (run / "checkpoint/state.pt").is_file()
+    field = fit(scene, run, job.recipe, job.steps, job.seconds, job.seed, local_device(job.device), resume)
+    write_report(run, field, scene=scene)
+    return field

@@ -1,0 +1,144 @@
+"""Scores: exact on a field that is the truth, right on known errors, and never NaN."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import MS, RGB, AnalyticField, scene_of, sphere
+
+from mmsynth.errors import InputError
+from mmsynth.field.field import Rendering
+from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim, spectral_angle_deg
+from mmsynth.scene.images import write_png16
+
+
+class Changed(AnalyticField):
+    """The true field with a known error in it."""
+
+    def __init__(self, change: Any, *args: Any) -> None:
+        super().__init__(*args)
+        self.change = change
+
+    def render(self, *args: Any, **kwargs: Any) -> Rendering:
+        out = super().render(*args, **kwargs)
+        return replace(out, **self.change(out))
+
+
+def score(field: AnalyticField, scene: Any, **kwargs: Any) -> dict[str, Any]:
+    return evaluate(field, scene, **kwargs)  # type: ignore[arg-type]
+
+
+def test_truth_scores_perfectly(tmp_path: Path) -> None:
+    field = AnalyticField(sphere())
+    calls: list[tuple[int, int]] = []
+    result = score(field, scene_of(field, tmp_path), progress=lambda done, total: calls.append((done, total)))
+    json.dumps(result, allow_nan=False)
+    assert set(result) == {"modalities", "geometry", "views", "seconds", "rays_per_s"}
+    assert result["views"] == [3] and result["rays_per_s"] > 0
+    for name, scores in result["modalities"].items():
+        assert scores["psnr"] > 90, name  # 16-bit rounding
+        assert scores["ssim"] > 0.9999
+        assert scores["foreground_from"] == "gt" and scores["psnr_foreground"] > 90
+        assert scores["psnr_truth"] > 100 and scores["psnr_truth_full"] > 100
+    assert set(result["modalities"]["pol"]) >= {"stokes_rmse", "dolp_rmse", "aolp_mae", "psnr_aligned"}
+    assert result["modalities"]["pol"]["aolp_mae"] < 1e-4
+    assert result["modalities"]["ms"]["sam"] < 1e-4
+    assert "sam" not in result["modalities"]["rgb"]
+    assert result["geometry"] == {"depth_mae": 0.0, "normal_mae_deg": 0.0, "hit_rate": 1.0, "chamfer_visible": 0.0}
+    assert calls == sorted(calls) and calls[-1][0] == calls[-1][1]
+
+
+def test_known_errors(tmp_path: Path) -> None:
+    scene = scene_of(AnalyticField(sphere()), tmp_path)
+
+    def change(out: Rendering) -> dict[str, Any]:
+        turn = np.radians(2 * 10.0)  # the AoLP by 10 degrees
+        rotation = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]])
+        depth = out.depth_z + 0.01
+        depth[: len(depth) // 2] = np.nan
+        return {
+            "channels": {n: c + np.float32(0.1) for n, c in out.channels.items()},
+            "stokes": {n: (s @ rotation.T) for n, s in out.stokes.items()},
+            "depth_z": depth,
+        }
+
+    result = score(Changed(change, sphere()), scene)
+    for scores in result["modalities"].values():
+        assert scores["psnr"] == pytest.approx(20.0, abs=0.01)
+        assert scores["psnr_truth"] == pytest.approx(20.0, abs=0.01)
+    assert result["modalities"]["pol"]["aolp_mae"] == pytest.approx(10.0, abs=1e-3)
+    assert result["modalities"]["pol"]["dolp_rmse"] < 1e-6
+    assert result["geometry"]["depth_mae"] == pytest.approx(0.01, abs=1e-5)
+    assert 0.2 < result["geometry"]["hit_rate"] < 0.8
+    assert result["geometry"]["chamfer_visible"] > 0.01  # half of the surface is missing
+
+
+def test_error_is_pooled_and_clipped(tmp_path: Path) -> None:
+    """A prediction above full scale is what a clipping sensor shows as full scale."""
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path)
+    for frame in scene.frames:
+        write_png16(frame.path, np.ones((frame.camera.height, frame.camera.width)))
+    bright = Changed(lambda out: {"channels": {n: c + 5.0 for n, c in out.channels.items()}}, sphere(), [RGB])
+    assert score(bright, scene)["modalities"]["rgb"]["psnr"] == pytest.approx(120.0)
+
+
+def test_foreground_sources(tmp_path: Path) -> None:
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path, truth=False)
+    result = score(field, scene)
+    assert result["modalities"]["rgb"]["foreground_from"] == "opacity"
+    assert "psnr_truth" not in result["modalities"]["rgb"] and result["geometry"] == {}
+    write_png16(tmp_path / "mask.png", np.eye(18, 24))
+    masked = replace(scene, frames=tuple(replace(f, mask=tmp_path / "mask.png") for f in scene.frames))
+    assert score(field, masked)["modalities"]["rgb"]["foreground_from"] == "masks"
+
+
+def test_empty_mask_is_left_out(tmp_path: Path) -> None:
+    field = AnalyticField(lambda p: np.full(p.shape[:-1], 1.0), [MS])
+    result = score(field, scene_of(field, tmp_path, truth=False))
+    assert "psnr_foreground" not in result["modalities"]["ms"]
+    json.dumps(result, allow_nan=False)
+
+
+def test_views(tmp_path: Path) -> None:
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path)
+    assert score(field, scene, views=[0, 2])["views"] == [0, 2]
+    with pytest.raises(InputError, match="view 77"):
+        score(field, scene, views=[0, 77])
+
+
+def test_damaged_truth(tmp_path: Path) -> None:
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path)
+    (tmp_path / "gt/rgb/0003.npz").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match=r"gt.rgb.0003\.npz: damaged"):
+        score(field, scene)
+
+
+def test_ssim_never_sees_the_mosaic() -> None:
+    """Channels of very different levels make the interleaved image a checkerboard; sub-frames are smooth."""
+    ramp = np.linspace(0.2, 0.8, 40)[None, :] * np.ones((40, 1))
+    gains = np.array([[1.0, 0.1], [0.5, 1.0]])
+    raw = ramp * np.tile(gains, (20, 20))
+    noisy = raw + 0.05 * np.random.default_rng(0).standard_normal(raw.shape)
+    values = raw_ssim(raw, noisy, np.ones(raw.shape, bool), RGB)
+    assert len(values) == 4 and all(v < 0.9 for v in values)
+    assert raw_ssim(raw, raw, np.ones(raw.shape, bool), RGB) == pytest.approx([1.0] * 4)
+    tiny = np.ones((9, 9))
+    assert len(raw_ssim(tiny, tiny, np.ones((9, 9), bool), MS)) == 9  # 3 x 3 sub-frames
+    assert raw_ssim(tiny[:5, :5], tiny[:5, :5], np.ones((5, 5), bool), MS) == []
+
+
+def test_small_spectral_angles_are_exact() -> None:
+    """arccos of the normalised dot product gives 0 or 0.02 degrees here in float32."""
+    a = np.array([1.0, 1.0, 1.0])
+    b = a + 1e-6 * np.array([1.0, 0.0, -1.0])
+    assert spectral_angle_deg(a, b) == pytest.approx(np.degrees(1e-6 * np.sqrt(2 / 3)), rel=1e-4)
+    assert np.isnan(spectral_angle_deg(a, 0 * a))
