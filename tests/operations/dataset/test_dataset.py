@@ -109,7 +109,7 @@ def test_resumes(tmp_path: Path) -> None:
 def test_processes_make_the_same_bytes_as_one(tmp_path: Path, format: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes last writes the summary; nobody waits, and a view at the border of two shares has its flow to the next."""
     monkeypatch.setattr("mmsynth.operations.dataset.generate.PER_SHARD", 2)
-    monkeypatch.setattr("mmsynth.operations.dataset.generate.index.PER_SHARD", 2)
+    monkeypatch.setattr("mmsynth.operations.dataset.index.PER_SHARD", 2)
     field: Any = AnalyticField(sphere())
     generate_dataset(field, views_of(field, 5), tmp_path / "one", format=format)
     written = [generate_dataset(field, views_of(field, 5), tmp_path / "many", format=format, share=Share(k, 3)) for k in (2, 0, 1)]
@@ -121,7 +121,7 @@ def test_processes_make_the_same_bytes_as_one(tmp_path: Path, format: str, monke
 def test_views_whose_shard_is_still_to_come_are_not_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another process has rendered its views and is about to pack them."""
     monkeypatch.setattr("mmsynth.operations.dataset.generate.PER_SHARD", 2)
-    monkeypatch.setattr("mmsynth.operations.dataset.generate.index.PER_SHARD", 2)
+    monkeypatch.setattr("mmsynth.operations.dataset.index.PER_SHARD", 2)
     field: Any = AnalyticField(sphere())
     make = lambda out, **how: generate_dataset(field, views_of(field, 4), out, format="webdataset", **how)
     make(tmp_path / "one")
@@ -150,7 +150,7 @@ def test_shares_cover_everything_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_shard_that_was_cut_off_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mmsynth.operations.dataset.generate.PER_SHARD", 2)
-    monkeypatch.setattr("mmsynth.operations.dataset.generate.index.PER_SHARD", 2)
+    monkeypatch.setattr("mmsynth.operations.dataset.index.PER_SHARD", 2)
     field: Any = AnalyticField(sphere())
     generate_dataset(field, views_of(field, 5), tmp_path / "whole", format="webdataset")
     before = content(tmp_path / "whole")
