@@ -16,10 +16,10 @@ from mmsynth.version import __version__
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 if TYPE_CHECKING:
-    from mmsynth.errors import InputError
+    from mmsynth.errors import DivergedError, InputError
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
-    from mmsynth.fitting.trainer import fit
+    from mmsynth.fitting.run import fit
     from mmsynth.operations.conversion.methods import convert
     from mmsynth.operations.dataset.aligned import AlignedDataset
     from mmsynth.operations.dataset.generate import generate_dataset
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "AlignedDataset": "operations.dataset.aligned",
+    "DivergedError": "errors",
     "InputError": "errors",
     "Field": "field.field",
     "Rendering": "field.field",
@@ -39,7 +40,7 @@ _HOMES = {
     "calibrate_noise": "operations.simulation.calibrate_noise",
     "Recipe": "fitting.recipe",
     "load_recipe": "fitting.recipe",
-    "fit": "fitting.trainer",
+    "fit": "fitting.run",
     "convert": "operations.conversion.methods",
     "generate_dataset": "operations.dataset.generate",
     "evaluate": "operations.evaluation.evaluate",
@@ -50,6 +51,7 @@ _HOMES = {
 }
 __all__ = [
     "AlignedDataset",
+    "DivergedError",
     "Field",
     "InputError",
     "Recipe",

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
 
 app = typer.Typer(
     add_completion=False,
@@ -33,7 +33,7 @@ FramesOption = Annotated[str | None, typer.Option(help="training frames to keep 
 
 
 def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a command whose ``InputError`` becomes one sentence on stderr and exit code 2."""
+    """Register a command whose errors (``mmsynth.errors``) become one sentence on stderr and an exit code."""
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
         @of.command(name)
@@ -41,9 +41,9 @@ def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]],
         def guarded(*args: Any, **kwargs: Any) -> None:
             try:
                 function(*args, **kwargs)
-            except InputError as error:
+            except (InputError, DivergedError) as error:
                 print(f"error: {error}", file=sys.stderr)
-                raise typer.Exit(2) from None
+                raise typer.Exit(error.exit_code) from None
             except KeyboardInterrupt:
                 print("interrupted", file=sys.stderr)
                 raise typer.Exit(130) from None
@@ -200,11 +200,11 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
-    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.run import fit as fit_field
     from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
-    from mmsynth.fitting.trainer import Progress, pick_device
-    from mmsynth.fitting.trainer import fit as fit_field
+    from mmsynth.fitting.trainer import FitProgress
     from mmsynth.report.report import write_report
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
@@ -222,7 +222,7 @@ def fit(
         say(f"note: {problem}")
     with _bar("fit", as_json) as show:
 
-        def on_step(news: Progress) -> None:
+        def on_step(news: FitProgress) -> None:
             psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
             show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
 
@@ -238,7 +238,16 @@ def fit(
             explain(needs.evidence)
 
         field = fit_field(
-            loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume, on_start=on_start, on_step=on_step
+            loaded,
+            folder,
+            recipe=recipe,
+            steps=steps,
+            budget=seconds,
+            seed=seed,
+            device=pick_device(device),
+            resume=resume,
+            on_start=on_start,
+            on_step=on_step,
         )
         explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
     write_report(folder, field, scene=loaded)
@@ -360,7 +369,7 @@ def generate_dataset(
 ) -> None:
     """An aligned dataset: every modality, depth, normals, opacity, coverage, flow, intrinsics and pose per view. Under torchrun every
     process makes its share."""
-    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.dataset import generate as dataset
     from mmsynth.operations.dataset import index as dataset_index
     from mmsynth.operations.output.work_partition import local_device, share_of_environment
@@ -426,8 +435,8 @@ def batch(
     as_json: JsonOption = False,
 ) -> None:
     """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.fitting.trainer import pick_device
     from mmsynth.operations.output.work_partition import share_of_environment
     from mmsynth.workflows.batch import Job, read_scene_list, run_batch
 
@@ -587,8 +596,8 @@ def bench_fit(
 ) -> None:
     """Error over time: a fit from scratch per time budget, each in a process of its own."""
     from mmsynth.bench.fit import bench_fit as measure
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.fitting.trainer import pick_device
 
     times = [_seconds(text, "--budgets") for text in budgets.split(",")]
     with _bar("bench fit", as_json) as show:
@@ -627,7 +636,7 @@ def bench_ablation(
 ) -> None:
     """What each choice is worth: variants of a fit against a baseline, in seconds and dB."""
     from mmsynth.bench.ablation import bench_ablation as measure
-    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.fitting.device import pick_device
 
     seconds = _length(steps, budget, "60s")
     chosen = None if only is None else [name.strip() for name in only.split(",")]
