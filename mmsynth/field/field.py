@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -24,6 +23,7 @@ from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
 from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Frame, Region, Sensor
+from mmsynth.scene.serialisation import camera_from_json, camera_to_json, sensor_from_json, sensor_to_json
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import reference_axes
 
@@ -309,8 +309,8 @@ class Field(nn.Module):
             "view_dependence": self.view_dependence,
             "region": asdict(self.region),
             "unit": self.unit,
-            "sensors": [_sensor_to_json(s) for s in self.sensors.values()],
-            "cameras": {n: asdict(c) for n, c in self.cameras.items()},
+            "sensors": [sensor_to_json(s) for s in self.sensors.values()],
+            "cameras": {n: camera_to_json(c) for n, c in self.cameras.items()},
             "rig": {n: m.tolist() for n, m in self.rig.items()},
             "corrections": {
                 "views": {str(v): m.tolist() for v, m in self.corrections.views.items()},
@@ -333,9 +333,9 @@ class Field(nn.Module):
         manifest = read_json(run / "manifest.json")
         try:
             stored = manifest["field"]
-            sensors = {s["name"]: _sensor_from_json(s) for s in stored["sensors"]}
+            sensors = {s["name"]: sensor_from_json(s) for s in stored["sensors"]}
             region = Region(tuple(stored["region"]["centre"]), stored["region"]["radius"])
-            cameras = {n: Camera(**{**c, "distortion": tuple(c["distortion"])}) for n, c in stored["cameras"].items()}
+            cameras = {n: camera_from_json(c) for n, c in stored["cameras"].items()}
             rig = {n: np.array(m) for n, m in stored["rig"].items()}
             sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored["design"].items()}
             field = Field(Design(**sizes), sensors, stored["radiance_scale"], region, stored["unit"], cameras, rig)
@@ -354,22 +354,3 @@ class Field(nn.Module):
         if device == "cpu":
             kernels.announce_compilation()  # a run may have been fitted on another machine
         return field.to(device)
-
-
-def _sensor_to_json(sensor: Sensor) -> dict[str, Any]:
-    out = asdict(sensor)
-    out["mosaic"] = None if sensor.mosaic is None else sensor.mosaic.tolist()
-    out["saturation"] = sensor.saturation if np.isfinite(sensor.saturation) else None  # float images never clip; JSON has no inf
-    return json.loads(json.dumps(out))
-
-
-def _sensor_from_json(stored: dict[str, Any]) -> Sensor:
-    angles = stored["polarizer_angles_deg"]
-    return Sensor(
-        name=stored["name"],
-        channels=tuple(stored["channels"]),
-        wavelengths_nm=tuple(stored["wavelengths_nm"]),
-        mosaic=None if stored["mosaic"] is None else np.array(stored["mosaic"]),
-        polarizer_angles_deg=None if angles is None else tuple(angles),
-        saturation=float("inf") if stored["saturation"] is None else stored["saturation"],
-    )

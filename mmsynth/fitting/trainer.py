@@ -33,6 +33,7 @@ from mmsynth.fitting.refinement import Refinement, see
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
 from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
 from mmsynth.scene.scene import Scene
+from mmsynth.scene.serialisation import CONVENTIONS
 from mmsynth.version import __version__
 
 CHECKPOINT_SECONDS = 60.0
@@ -507,13 +508,7 @@ def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
         "threads": torch.get_num_threads(),
         "cores": os.cpu_count(),
         "device": str(trainer.device),
-        "conventions": {
-            "camera_axes": "OpenCV: x right, y down, z forward",
-            "pixels": "centre of the top-left pixel is (0, 0)",
-            "world": f"the input's own frame, {scene.unit}",
-            "radiance": "linear, 1.0 = full scale",
-            "polarization": "angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
-        },
+        "conventions": CONVENTIONS,
     }
     field.save(run)
     return field
