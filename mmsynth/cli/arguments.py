@@ -63,8 +63,8 @@ def modality_pairs(text: str, known: list[str]) -> list[tuple[str, str]]:
     return [(canonical_modality(a), canonical_modality(b)) for a, b in pairs]
 
 
-def whole_numbers(text: str, option: str) -> list[int]:
-    """ "0,1" → [0, 1]"""
+def whole_numbers(text: str, option: str, example: str = "0,1") -> list[int]:
+    """Whole numbers joined by commas."""
     if not re.fullmatch(r"\d+(,\d+)*", text):
         raise InputError(f"{option} {text!r}: expected numbers such as {example}.")
     return [int(number) for number in text.split(",")]
