@@ -24,6 +24,7 @@ from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.scene.scene import Scene
+from mmsynth.scene.serialisation import CONVENTIONS
 from mmsynth.version import __version__
 
 CHECKPOINT_SECONDS = 60.0
@@ -147,13 +148,7 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "cores": os.cpu_count(),
         "device": str(trainer.device),
-        "conventions": {
-            "camera_axes": "OpenCV: x right, y down, z forward",
-            "pixels": "centre of the top-left pixel is (0, 0)",
-            "world": f"the input's own frame, {scene.unit}",
-            "radiance": "linear, 1.0 = full scale",
-            "polarization": "angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
-        },
+        "conventions": CONVENTIONS,
     }
 
 
