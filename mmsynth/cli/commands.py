@@ -205,7 +205,7 @@ def fit(
     from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
     from mmsynth.fitting.trainer import Progress, pick_device
     from mmsynth.fitting.trainer import fit as fit_field
-    from mmsynth.report.report import write_report
+    from mmsynth.report.report import write_run_report
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
 
@@ -241,7 +241,7 @@ def fit(
             loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume, on_start=on_start, on_step=on_step
         )
         explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
-    write_report(folder, field, scene=loaded)
+    write_run_report(folder, field, scene=loaded)
     mark_latest(folder)
     facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
     if as_json:
@@ -263,7 +263,7 @@ def evaluate(
 ) -> None:
     """Score the test views."""
     from mmsynth.operations.evaluation.evaluate import evaluate as score
-    from mmsynth.report.report import write_report
+    from mmsynth.report.report import write_run_report
     from mmsynth.report.text import conversion_text, score_text
 
     folder, field, scene = _load(run)
@@ -280,7 +280,7 @@ def evaluate(
         return
     with _bar("evaluate", as_json) as show:
         scores = score(field, scene, progress=show)
-    write_report(folder, field, scores, scene=scene)
+    write_run_report(folder, field, scores, scene=scene)
     print(json.dumps(scores) if as_json else score_text(scores))
 
 
@@ -549,7 +549,7 @@ def mesh(
     as_json: JsonOption = False,
 ) -> None:
     """The surface with every modality on it, in the input's frame and unit."""
-    from mmsynth.operations.mesh.extract import mesh_to_file
+    from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
     from mmsynth.report.text import mesh_text
 
     if geometry_only and not min_views and against is None:
@@ -557,10 +557,11 @@ def mesh(
     else:
         folder, field, scene = _load(run)
     destination, at = out or folder / "mesh.ply", _lengths(distances)
+    options = MeshOptions(
+        resolution, keep=keep_of(keep), closed=closed, attributes=not geometry_only, min_views=min_views, faces=faces, max_error=max_error
+    )
     with _bar("mesh", as_json) as show:
-        report = mesh_to_file(
-            field, destination, resolution, keep, closed, scene, not geometry_only, min_views, faces, max_error, against, at, show
-        )
+        report = mesh_to_file(field, destination, options, scene=scene, against=against, distances=at, progress=show)
     print(json.dumps(report) if as_json else mesh_text(report))
 
 
