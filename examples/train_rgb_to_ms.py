@@ -24,8 +24,9 @@ from torch.utils.data import DataLoader
 
 from mmsynth import AlignedDataset, InputError, load_scene
 from mmsynth.operations.dataset.aligned import crop_and_flip
-from mmsynth.operations.evaluation.evaluate import GroundTruth, psnr_from_mse, spectral_angle_deg
+from mmsynth.operations.evaluation.evaluate import psnr_from_mse, spectral_angle_deg
 from mmsynth.packaged import data_folder
+from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.sensors.mosaic import demosaic, mosaic
 

@@ -9,7 +9,7 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
-from mmsynth.version import __version__
+from mmsynth.version import __version__ as __version__
 
 # OpenMP's threads spin for milliseconds at every barrier by default, which stalls a fit beside another busy process.
 # A short spin costs nothing alone and was 1.6 times as fast beside one. Read when torch is loaded; a user's own setting stays.
@@ -56,7 +56,6 @@ __all__ = [
     "Recipe",
     "Rendering",
     "SensorTwin",
-    "__version__",
     "calibrate_noise",
     "convert",
     "evaluate",

@@ -1,5 +1,5 @@
 """``python -m mmsynth``."""
 
-from mmsynth.cli.commands import main
+from mmsynth.cli import main
 
 main()

@@ -25,12 +25,12 @@ from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, meas
 from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.operations.output.progress import Progress
-from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.camera import Camera, resized
 from mmsynth.sensors.noise import NoiseModel, record
 from mmsynth.sensors.photon_transfer import photon_transfer, photon_transfer_of_frames
 from mmsynth.sensors.sensor_file import Response, SensorFile
 from mmsynth.sensors.spectral import MEASURED_ERROR, SMOOTH_NM, combine
-from mmsynth.sensors.twin import SensorTwin, aperture, blur, fine_camera
+from mmsynth.sensors.twin import SensorTwin, aperture, blur
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -135,7 +135,7 @@ def optics() -> list[Method]:
 
 def supersampling() -> list[Method]:
     """Rays per pixel along each axis: a picture of edges and lines against its exact mean over each pixel (by 32 x 32)."""
-    picture = lambda s: _star(fine_camera(Camera(80, 60, 50.0, 50.0, 39.5, 29.5), s))
+    picture = lambda s: _star(resized(Camera(80, 60, 50.0, 50.0, 39.5, 29.5), 80 * s))
     truth = aperture(picture(32), 32)
 
     judge = lambda found: typical((found - truth).abs().numpy())

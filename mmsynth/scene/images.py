@@ -16,6 +16,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import cv2
 import numpy as np
@@ -82,6 +83,19 @@ def read_native(path: Path) -> np.ndarray:
     if image.ndim not in (2, 3) or image.size == 0:
         raise InputError(f"{path}: array of shape {image.shape}, expected (height, width) or (height, width, channels).")
     return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
+def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndarray]:
+    """All arrays of an npz file; ``name``: for errors.
+
+    Raises:
+        InputError: missing or damaged.
+    """
+    try:
+        with np.load(file) as arrays:
+            return {key: arrays[key] for key in arrays.files}
+    except Exception as error:  # zipfile, zlib and numpy each have their own
+        raise InputError(f"{name or file}: damaged or missing, could not be read ({_first_line(error)}).") from error
 
 
 def check_file(path: Path) -> None:

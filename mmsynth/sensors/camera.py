@@ -8,7 +8,7 @@ Pixel coordinates u, v are column and row; the centre of the top-left pixel is (
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -72,6 +72,21 @@ class Camera:
     def intrinsics(self) -> np.ndarray:
         """(4,) fx, fy, cx, cy."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
+
+
+def resized(camera: Camera, width: int, margin: int = 0) -> Camera:
+    """The same lens and field of view on ``width`` pixels in a row, as square as the camera's own; with a margin on each side [px]."""
+    height = max(1, round(camera.height * width / camera.width))
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width + 2 * margin,
+        height=height + 2 * margin,
+        fx=camera.fx * x,
+        fy=camera.fy * y,
+        cx=(camera.cx + 0.5) * x - 0.5 + margin,
+        cy=(camera.cy + 0.5) * y - 0.5 + margin,
+    )
 
 
 def project_points(points: Tensor, intrinsics: Tensor, coefficients: Tensor, lens: Lens = "brown_conrady") -> tuple[Tensor, Tensor]:
@@ -163,6 +178,18 @@ def ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     directions.setflags(write=False)
     valid.setflags(write=False)
     return directions, valid
+
+
+def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray) -> np.ndarray:
+    """Points that pixels see: depth along the ray (H, W) → (H, W, 3) float64, world frame, NaN where the depth is."""
+    directions = ray_map(camera)[0] @ camera_to_world[:3, :3].T
+    return camera_to_world[:3, 3] + directions * depth_ray[..., None].astype(np.float64)
+
+
+def depth_along_rays(camera: Camera, depth_z: np.ndarray) -> np.ndarray:
+    """Depth along the optical axis (H, W) → along the ray, float64; NaN where the ray does not lead forward."""
+    forward = ray_map(camera)[0][..., 2]
+    return depth_z.astype(np.float64) / np.where(forward > 0, forward, np.nan)
 
 
 def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:

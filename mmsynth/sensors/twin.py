@@ -9,7 +9,6 @@ Light is linear, 1.0 = full scale. Everything up to the rounding is differentiab
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -23,20 +22,6 @@ from mmsynth.sensors.mosaic import channel_map
 from mmsynth.sensors.noise import generator, record
 from mmsynth.sensors.polarization import analyser_axes, frame_angle, reference_axes
 from mmsynth.sensors.sensor_file import SensorFile
-
-
-def fine_camera(camera: Camera, supersampling: int) -> Camera:
-    """The same camera with ``supersampling`` times as many pixels along each axis, which tile the original ones."""
-    s = supersampling
-    return dataclasses.replace(
-        camera,
-        width=s * camera.width,
-        height=s * camera.height,
-        fx=s * camera.fx,
-        fy=s * camera.fy,
-        cx=s * (camera.cx + 0.5) - 0.5,
-        cy=s * (camera.cy + 0.5) - 0.5,
-    )
 
 
 def blur_radius(sigma: float) -> int:

@@ -10,7 +10,7 @@ import pytest
 from test_cli import run
 from typer.testing import CliRunner
 
-from mmsynth.cli.commands import app
+from mmsynth.cli import app
 
 
 @pytest.fixture(autouse=True)

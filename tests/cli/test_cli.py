@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mmsynth.cli.commands import app
+from mmsynth.cli import app
 from mmsynth.packaged import data_folder
 
 ROOT = Path(__file__).parents[2]

@@ -15,12 +15,12 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from mmsynth.errors import InputError
-from mmsynth.sensors.camera import Camera, project, ray_map
+from mmsynth.sensors.camera import Camera, project, ray_map, resized
 from mmsynth.sensors.mosaic import mosaic
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.polarization import OffAxis, analyser_axes, frame_angle, reference_axes, stokes_to_intensities
 from mmsynth.sensors.sensor_file import Channel, Polarizer, SensorFile
-from mmsynth.sensors.twin import SensorTwin, aperture, blur, fine_camera, vignetting_map
+from mmsynth.sensors.twin import SensorTwin, aperture, blur, vignetting_map
 
 PINHOLE = Camera(40, 30, 30.0, 31.0, 19.5, 14.5)
 CURVED = Camera(40, 30, 30.0, 31.0, 20.1, 13.8, (-0.118, 0.092, 0.0006, -0.0009, 0.01, 0.0))
@@ -56,7 +56,7 @@ def _stokes(*shape: int, seed: int = 0) -> Tensor:
 @pytest.mark.parametrize("s", [1, 2, 3, 5])
 def test_fine_pixels_tile_the_pixels(camera: Camera, s: int) -> None:
     """Fine pixel j lies at (j + ½) / s - ½ of the sensor; its ray, in the camera as it was, comes back to that place."""
-    fine = fine_camera(camera, s)
+    fine = resized(camera, s * camera.width)
     assert (fine.width, fine.height) == (s * camera.width, s * camera.height)
     v, u = ((np.mgrid[: fine.height, : fine.width] + 0.5) / s) - 0.5
     directions, valid = ray_map(fine)

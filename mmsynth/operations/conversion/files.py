@@ -16,11 +16,12 @@ from mmsynth.operations.conversion.methods import Converted, chosen_method, conv
 from mmsynth.operations.conversion.register import landmarks, register
 from mmsynth.operations.output import previews
 from mmsynth.operations.output.progress import Counter, Progress
-from mmsynth.operations.output.records import CONVENTIONS, FORMATS, UNITS, camera_json, modality_arrays, sensor_json, write_record
+from mmsynth.operations.output.records import FORMATS, UNITS, modality_arrays, write_record
 from mmsynth.operations.views.coverage import TrainingRays, training_rays
 from mmsynth.operations.views.trajectories import View
 from mmsynth.scene.images import load_frame, write_png16
-from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
+from mmsynth.scene.scene import Frame, PosedCamera, Scene, Sensor, canonical_modality
+from mmsynth.scene.serialisation import CONVENTIONS, channels_to_json, posed_to_json
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.mosaic import photosites_of
 
@@ -264,8 +265,8 @@ def _convert_each(
             "frame_exposure": found.exposure,
             "guided": float(found.guided.mean()),
             "registration": item.registration,
-            "sensor": sensor_json(sensor),
-            "camera": camera_json(*(item.seen_by or (item.camera, item.pose))),
+            "sensor": channels_to_json(sensor),
+            "camera": posed_to_json(PosedCamera(*(item.seen_by or (item.camera, item.pose)))),
             "conventions": CONVENTIONS,
             "unit": field.unit,
             "preview_exposure": exposure,

@@ -28,9 +28,9 @@ from torch import Tensor
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion.guidance import Guide, contrast, guide, linear_map
 from mmsynth.operations.views.coverage import TrainingRays, coverage
-from mmsynth.operations.views.visibility import SAME_SURFACE, surface_points
+from mmsynth.operations.views.visibility import SAME_SURFACE
 from mmsynth.scene.scene import Sensor, canonical_modality
-from mmsynth.sensors.camera import Camera, project
+from mmsynth.sensors.camera import Camera, project, surface_points
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering

@@ -15,10 +15,11 @@ from torch.utils.data import Dataset
 
 from mmsynth.errors import InputError
 from mmsynth.operations.dataset.index import read_dataset
-from mmsynth.operations.output.records import camera_from_json, camera_json, read_npz, read_record, sensor_json
-from mmsynth.scene.images import load_frame
+from mmsynth.operations.output.records import read_record
+from mmsynth.scene.images import load_frame, read_npz
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.scene import Frame, canonical_modality
+from mmsynth.scene.scene import Frame, PosedCamera, canonical_modality
+from mmsynth.scene.serialisation import channels_to_json, posed_from_json, posed_to_json
 from mmsynth.sensors.polarization import flip_stokes
 
 Item = dict[str, Tensor]
@@ -82,8 +83,9 @@ class AlignedDataset(Dataset[Item]):
         grids: Sequence[str | None] = self.modalities if native else [None]
         for grid in grids:
             prefix = "" if grid is None else f"{grid}/"
-            camera, pose = camera_from_json(view["cameras"][grid or next(iter(view["cameras"]))])
-            item[f"{prefix}intrinsics"], item[f"{prefix}camera_to_world"] = torch.from_numpy(camera.matrix), torch.from_numpy(pose)
+            posed = posed_from_json(view["cameras"][grid or next(iter(view["cameras"]))])
+            item[f"{prefix}intrinsics"] = torch.from_numpy(posed.camera.matrix)
+            item[f"{prefix}camera_to_world"] = torch.from_numpy(posed.camera_to_world)
             for record in (r if grid is None else f"{r}_{grid}" for r in _GEOMETRY):
                 if self.geometry and any(f["record"] == record for f in view["files"].values()):
                     item |= {f"{prefix}{key}": _as_tensor(array) for key, array in self._record(view, record).items()}
@@ -184,6 +186,6 @@ def _content_of_scene(path: Path) -> dict[str, Any]:
             same = frame.camera == first.camera and np.allclose(frame.camera_to_world, first.camera_to_world, rtol=0, atol=1e-9)
             if len(frames) < len(scene.sensors) or not same or scene.sensors[name].mosaic is not None:
                 raise InputError(f"{frame.path}: not aligned with the other modalities of view {view}, expected one pixel grid, no mosaic.")
-        cameras = {name: camera_json(frame.camera, frame.camera_to_world) for name, frame in frames.items()}
+        cameras = {name: posed_to_json(PosedCamera(frame.camera, frame.camera_to_world)) for name, frame in frames.items()}
         listed.append({"name": f"{view:04d}", "cameras": cameras, "files": {}, "frames": frames, "sensors": scene.sensors})
-    return {"modalities": {name: sensor_json(sensor) for name, sensor in scene.sensors.items()}, "views": listed}
+    return {"modalities": {name: channels_to_json(sensor) for name, sensor in scene.sensors.items()}, "views": listed}

@@ -39,17 +39,14 @@ from mmsynth.files import sha256_of, write_json
 from mmsynth.operations.dataset.index import PER_SHARD, drop_views, finished_shard, finished_view, pack_shard, shard_name, view_folder
 from mmsynth.operations.output.previews import preview_linear
 from mmsynth.operations.output.progress import Counter, Progress
+from mmsynth.operations.output.records import FORMATS as RECORD_FORMATS
 from mmsynth.operations.output.records import (
-    CONVENTIONS,
     UNITS,
-    camera_json,
     field_hash,
     modality_arrays,
     read_record,
-    sensor_json,
     write_record,
 )
-from mmsynth.operations.output.records import FORMATS as RECORD_FORMATS
 from mmsynth.operations.output.work_partition import Share
 from mmsynth.operations.simulation.simulate import simulate
 from mmsynth.operations.views.coverage import TrainingRays, coverage
@@ -58,7 +55,8 @@ from mmsynth.operations.views.trajectories import View
 from mmsynth.scene.images import write_png16
 from mmsynth.scene.layouts.mmsdata import meta_content
 from mmsynth.scene.poses import OPENGL_TO_OPENCV
-from mmsynth.scene.scene import canonical_modality
+from mmsynth.scene.scene import PosedCamera, canonical_modality
+from mmsynth.scene.serialisation import CONVENTIONS, channels_to_json, posed_to_json
 from mmsynth.sensors.camera import Camera
 from mmsynth.version import __version__
 
@@ -202,13 +200,13 @@ def _planned(
         "rig": rig,
         "format": format,
         "outputs": list(wanted),
-        "modalities": {name: sensor_json(field.sensors[name]) for name in names},
+        "modalities": {name: channels_to_json(field.sensors[name]) for name in names},
         "unit": field.unit,
         "conventions": CONVENTIONS,
         "versions": {"mmsynth": __version__} | {package: version(package) for package in ("numpy", "torch")},
     }
     stated = [
-        {"name": name, "cameras": {m: camera_json(c, p) for m, (c, p) in cameras.items()}}
+        {"name": name, "cameras": {m: posed_to_json(PosedCamera(c, p)) for m, (c, p) in cameras.items()}}
         for (_, _, name), cameras in zip(views, placed, strict=True)
     ]
     known = json.dumps(request, sort_keys=True)

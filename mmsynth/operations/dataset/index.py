@@ -13,7 +13,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json, sha256_of, write_atomic, write_json
-from mmsynth.operations.output.records import read_npz
+from mmsynth.scene.images import read_npz
 
 PER_SHARD = 64
 _OF_A_SHARD = ("sha256", "bytes")

@@ -23,8 +23,9 @@ from torchmetrics.functional.image import error_relative_global_dimensionless_sy
 
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion.methods import METHODS, Converted, carried_through, chosen_method, convert_frame
-from mmsynth.operations.evaluation.evaluate import GroundTruth, psnr_from_mse, spectral_angle_deg
+from mmsynth.operations.evaluation.evaluate import psnr_from_mse, spectral_angle_deg
 from mmsynth.operations.output.progress import Progress
+from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera

@@ -35,9 +35,10 @@ from skimage.metrics import structural_similarity
 
 from mmsynth.errors import InputError
 from mmsynth.operations.output.progress import Counter, Progress
+from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame, read_native
-from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
-from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.sensors.camera import depth_along_rays, surface_points
 from mmsynth.sensors.mosaic import photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
@@ -135,40 +136,6 @@ def spectral_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-class GroundTruth:
-    """The scene's ``gt`` folder; every method gives None where it has nothing."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.folder = scene.root / "gt"
-
-    def arrays(self, *parts: str) -> dict[str, np.ndarray] | None:
-        path = self.folder.joinpath(*parts)
-        if not path.is_file():
-            return None
-        try:
-            with np.load(path) as loaded:
-                return {key: loaded[key] for key in loaded.files}
-        except Exception as error:  # zip, zlib and numpy each have their own exception for a damaged file
-            raise InputError(f"{path}: damaged ground truth, could not be read ({error}).") from error
-
-    def image(self, frame: Frame) -> np.ndarray | None:
-        """(H, W, C), or Stokes (H, W, 3), at the frame's own pose."""
-        found = self.arrays(frame.source_name or frame.sensor, f"{frame.view:04d}.npz")
-        return None if found is None or "data" not in found else found["data"].astype(np.float32)
-
-    def region(self, frame: Frame) -> np.ndarray | None:
-        found = self.arrays("masks", f"{frame.view:04d}_{frame.source_name or frame.sensor}.npz")
-        return None if found is None or "in_roi" not in found else found["in_roi"].astype(bool)
-
-    def geometry(self, view: int) -> dict[str, np.ndarray] | None:
-        return self.arrays("geometry", f"{view:04d}.npz")
-
-    def aligned(self, view: int) -> dict[str, np.ndarray]:
-        """By canonical modality name."""
-        found = self.arrays("aligned", f"{view:04d}.npz") or {}
-        return {canonical_modality(key): value.astype(np.float32) for key, value in found.items() if value.ndim == 3}
-
-
 def _checked(truth: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.ndarray | None:
     """Truth or a mask of the wrong size or channel count is an error of the scene, not a score."""
     if truth is not None and truth.shape != shape:
@@ -236,11 +203,8 @@ def _score_geometry(scores: _Scores, rendering: Rendering, truth: dict[str, np.n
         scores.add("normal_mae_deg", spectral_angle_deg(a[known], b[known]))
 
 
-def _surface_points(camera: Camera, pose: np.ndarray, depth_z: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """World points (N, 3) of the pixels ``where``."""
-    rays = ray_map(camera)[0][where]
-    in_camera = rays * (depth_z[where].astype(np.float64) / rays[:, 2])[:, None]
-    return in_camera @ pose[:3, :3].T + pose[:3, 3]
+def _seen_points(field: Field, frame: Frame, depth_z: np.ndarray) -> np.ndarray:
+    return surface_points(frame.camera, field.pose_of(frame), depth_along_rays(frame.camera, depth_z))
 
 
 def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> float | None:
@@ -316,8 +280,8 @@ def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, pro
         if "depth_z" in shape and scene.unit == "m":
             _score_geometry(geometry, rendering, shape, where)
             surface = where & rendering.valid
-            ours.append(_surface_points(frame.camera, field.pose_of(frame), rendering.depth_z, surface & np.isfinite(rendering.depth_z)))
-            true.append(_surface_points(frame.camera, field.pose_of(frame), shape["depth_z"], surface & (shape["depth_z"] > 0)))
+            ours.append(_seen_points(field, frame, rendering.depth_z)[surface & np.isfinite(rendering.depth_z)])
+            true.append(_seen_points(field, frame, shape["depth_z"])[surface & (shape["depth_z"] > 0)])
     shape_scores = _values(geometry, ("depth_mae", "normal_mae_deg", "hit_rate"))
     chamfer = _chamfer(ours, true) if ours else None
     return {

@@ -39,11 +39,10 @@ import trimesh
 from mmsynth.errors import InputError
 from mmsynth.operations.output import previews
 from mmsynth.operations.output.progress import Counter, Progress, parts
-from mmsynth.operations.views.coverage import resized
 from mmsynth.operations.views.visibility import inside
 from mmsynth.scene.scene import PosedCamera
-from mmsynth.sensors.camera import project
-from mmsynth.sensors.polarization import reference_axes
+from mmsynth.sensors.camera import project, resized
+from mmsynth.sensors.polarization import reference_axes, stokes_to_coherency
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -152,11 +151,9 @@ class _Sums:
 
 def polarized_part(s1: np.ndarray, s2: np.ndarray, directions: np.ndarray, camera_x: np.ndarray) -> np.ndarray:
     """p S0 e eᵀ of light with S1, S2 (N,) about the camera's x axis (3,) along rays (N, 3): (N, 3, 3), world; e: where it swings."""
-    x, y = (a.numpy() for a in reference_axes(torch.from_numpy(directions), torch.from_numpy(camera_x).expand(len(directions), 3)))
-    strength = np.hypot(s1, s2)
-    outer = lambda a, b: a[:, :, None] * b[:, None, :]
-    weigh = lambda w, m: w[:, None, None] * m
-    return 0.5 * (weigh(strength + s1, outer(x, x)) + weigh(strength - s1, outer(y, y)) + weigh(s2, outer(x, y) + outer(y, x)))
+    x, y = reference_axes(torch.from_numpy(directions), torch.from_numpy(camera_x).expand(len(directions), 3))
+    swinging = torch.from_numpy(np.stack([np.hypot(s1, s2), s1, s2], -1))  # light that is polarized through and through
+    return stokes_to_coherency(swinging, x, y).numpy()
 
 
 def add_attributes(mesh: trimesh.Trimesh, field: Field, scene: Scene, cell: float, progress: Progress | None = None) -> None:

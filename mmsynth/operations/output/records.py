@@ -1,4 +1,4 @@
-"""Named arrays of one picture as files, and back: npz, OpenEXR or TIFF; and what their sidecars say of cameras, sensors and conventions.
+"""Named arrays of one picture as files, and back: npz, OpenEXR or TIFF.
 
 A *record* is what belongs together: a modality (``data`` (H, W, C), for polarization also ``stokes`` (H, W, 3)), the geometry of a view.
 
@@ -14,16 +14,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import sha256_of
 from mmsynth.operations.output.previews import preview_linear
-from mmsynth.scene.images import read_exr, read_native, write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.images import read_exr, read_native, read_npz, write_exr, write_npz, write_tiff, write_tiff16
 from mmsynth.scene.scene import Sensor
-from mmsynth.sensors.camera import Camera
+from mmsynth.scene.serialisation import channels_to_json
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -31,45 +31,12 @@ if TYPE_CHECKING:
 FORMATS = ("npz", "exr", "tiff")
 UNITS = {"data": "full scale", "stokes": "full scale", "raw": "full scale", "flow": "px"}
 
-CONVENTIONS = {
-    "camera_axes": "OpenCV: x right, y down, z forward; camera_to_world 4x4",
-    "pixels": "centre of the top-left pixel is (0, 0)",
-    "distortion": "OpenCV's: lens brown_conrady k1 k2 p1 p2 k3 k4 k5 k6, kannala_brandt (fisheye) k1 k2 k3 k4, undistorted to distorted; "
-    "images are distorted, as the lens sees",
-    "radiance": "linear float32, 1.0 = full scale of the sensor; NaN where the lens has no ray",
-    "polarization": "S0 S1 S2 about the camera x axis; angles from image right towards image up; I = (S0 + S1 cos 2a + S2 sin 2a) / 2",
-    "depth": "depth_z along the optical axis, depth_ray along the ray; NaN = no hit",
-    "normal": "world frame, unit, outward; normal_camera the same in the camera's axes; NaN = no hit",
-    "world": "the scene's own frame and unit",
-}
-
 _PARTS = {
     "stokes": ("S0", "S1", "S2"),
     "normal": ("N.X", "N.Y", "N.Z"),
     "normal_camera": ("NC.X", "NC.Y", "NC.Z"),
     "flow": ("flow.U", "flow.V"),
 }
-
-
-def camera_json(camera: Camera, camera_to_world: np.ndarray) -> dict[str, Any]:
-    """Intrinsics, lens and pose in the library's conventions, ready for JSON."""
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "lens": camera.lens,
-        "distortion": list(camera.distortion),
-        "camera_to_world": np.asarray(camera_to_world, dtype=np.float64).tolist(),
-    }
-
-
-def camera_from_json(stated: Mapping[str, Any]) -> tuple[Camera, np.ndarray]:
-    """Camera and (4, 4) pose that ``camera_json`` wrote."""
-    numbers = {key: value for key, value in stated.items() if key not in ("camera_to_world", "distortion")}
-    return Camera(**numbers, distortion=tuple(stated["distortion"])), np.array(stated["camera_to_world"], dtype=np.float64)
 
 
 def field_hash(field: Field) -> str:
@@ -80,15 +47,6 @@ def field_hash(field: Field) -> str:
         digest.update(f"{name} {value.dtype} {value.shape}".encode())
         digest.update(value.tobytes())
     return digest.hexdigest()
-
-
-def sensor_json(sensor: Sensor) -> dict[str, Any]:
-    """Channel names, wavelengths and analyser angles of a sensor, ready for JSON."""
-    return {
-        "channels": list(sensor.channels),
-        "wavelengths_nm": list(sensor.wavelengths_nm),
-        "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
-    }
 
 
 def modality_arrays(values: np.ndarray, stokes: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -109,7 +67,7 @@ def write_record(
     Raises:
         InputError: the disk refused.
     """
-    facts = {} if sensor is None else sensor_json(sensor)
+    facts = {} if sensor is None else channels_to_json(sensor)
 
     def entry(path: Path, keys: Mapping[str, str], channels: Mapping[str, list[str]] | None = None) -> dict[str, Any]:
         described = {
@@ -173,20 +131,6 @@ def read_record(folder: Path, files: Mapping[str, Mapping[str, Any]], record: st
 
 
 _LAYOUT = {"spectralLayoutVersion": "1.0", "emissiveUnits": "DN (1 = full scale)", "polarisationHandedness": "right"}
-
-
-def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndarray]:
-    """All arrays of an npz file; name: for errors.
-
-    Raises:
-        InputError: missing or damaged.
-    """
-    try:
-        with np.load(file) as arrays:
-            return {key: arrays[key] for key in arrays.files}
-    except Exception as error:  # zipfile, zlib and numpy each have their own
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{name or file}: damaged or missing, could not be read ({reason}).") from error
 
 
 def _labels_of(sensor: Sensor | None) -> dict[str, np.ndarray]:

@@ -30,17 +30,18 @@ from mmsynth.errors import InputError
 from mmsynth.files import read_json, sha256_of, write_json, write_text
 from mmsynth.operations.conversion.files import source_views
 from mmsynth.operations.output.progress import Counter, Progress
-from mmsynth.operations.output.records import CONVENTIONS, camera_json, field_hash
+from mmsynth.operations.output.records import field_hash
 from mmsynth.operations.output.work_partition import Share
 from mmsynth.operations.views.trajectories import View
 from mmsynth.scene.images import write_dng, write_png, write_tiff
 from mmsynth.scene.layouts.mmsdata import meta_content
-from mmsynth.scene.scene import Scene, Sensor, canonical_modality
-from mmsynth.sensors.camera import Camera
+from mmsynth.scene.scene import PosedCamera, Scene, Sensor, canonical_modality
+from mmsynth.scene.serialisation import CONVENTIONS, posed_to_json
+from mmsynth.sensors.camera import Camera, resized
 from mmsynth.sensors.mosaic import crop_pattern, is_bayer
 from mmsynth.sensors.sensor_file import SensorFile, find_sensor_file, load_sensor, sensor_to_toml
 from mmsynth.sensors.spectral import Combination, combine, require_expressible
-from mmsynth.sensors.twin import SensorTwin, aperture, blur, blur_radius, fine_camera
+from mmsynth.sensors.twin import SensorTwin, aperture, blur, blur_radius
 from mmsynth.version import __version__
 
 if TYPE_CHECKING:
@@ -250,7 +251,7 @@ def render_light(
     has no ray. By strips of the picture: the finer grid of a whole one may not fit into memory.
     """
     s, sigma = planned.supersampling, planned.file.psf_sigma_px * planned.supersampling
-    fine = fine_camera(camera, s)
+    fine = resized(camera, s * camera.width)
     margin = s * math.ceil(blur_radius(sigma) / s)
     rows = max(margin, s * max(1, _STRIP_RAYS // (fine.width * s)))
 
@@ -456,7 +457,7 @@ def _facts(planned: Simulated, camera: Camera, pose: np.ndarray, frame: int, see
             label: {"residual": c.residual, "noise_gain": c.noise_gain, "weights": c.weights.tolist()}
             for label, c in planned.combinations.items()
         },
-        "camera": camera_json(camera, pose),
+        "camera": posed_to_json(PosedCamera(camera, pose)),
         "conventions": {key: CONVENTIONS[key] for key in ("camera_axes", "pixels", "distortion", "world")},
         "field": known,
         "versions": {"mmsynth": __version__} | {package: version(package) for package in ("numpy", "torch")},

@@ -24,7 +24,7 @@ comes from is all that coverage speaks of.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,9 +32,9 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.operations.output.progress import Progress
 from mmsynth.operations.views.trajectories import View
-from mmsynth.operations.views.visibility import hidden, inside, surface_points, towards
+from mmsynth.operations.views.visibility import hidden, inside, towards
 from mmsynth.scene.scene import Scene
-from mmsynth.sensors.camera import Camera, project, unproject
+from mmsynth.sensors.camera import Camera, project, resized, surface_points, unproject
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -65,21 +65,6 @@ class TrainingRays:
     place: np.ndarray
     small: tuple[Camera, ...]
     depth_ray: tuple[np.ndarray, ...]
-
-
-def resized(camera: Camera, width: int, margin: int = 0) -> Camera:
-    """The same lens and field of view on ``width`` pixels in a row, as square as the camera's own; with a margin on each side [px]."""
-    height = max(1, round(camera.height * width / camera.width))
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        width=width + 2 * margin,
-        height=height + 2 * margin,
-        fx=camera.fx * x,
-        fy=camera.fy * y,
-        cx=(camera.cx + 0.5) * x - 0.5 + margin,
-        cy=(camera.cy + 0.5) * y - 0.5 + margin,
-    )
 
 
 def training_rays(field: Field, scene: Scene, modalities: Sequence[str] | None = None, progress: Progress | None = None) -> TrainingRays:

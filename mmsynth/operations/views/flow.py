@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mmsynth.operations.views.visibility import hidden, inside, surface_points, towards
-from mmsynth.sensors.camera import Camera, project
+from mmsynth.operations.views.visibility import hidden, inside, towards
+from mmsynth.sensors.camera import Camera, project, surface_points
 
 
 def optical_flow(

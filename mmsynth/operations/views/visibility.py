@@ -8,17 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.camera import Camera
 
 SAME_SURFACE = 0.02
 """Of the distance: how far a point may lie behind what is seen there and still belong to it. Fields are no more exact than that, and
 things nearer together than that (6 cm at 3 m) are not told apart."""
-
-
-def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray) -> np.ndarray:
-    """Points that pixels see: depth_ray (H, W) → (H, W, 3) float64, world frame, NaN where the depth is."""
-    directions = ray_map(camera)[0] @ camera_to_world[:3, :3].T
-    return camera_to_world[:3, 3] + directions * depth_ray[..., None].astype(np.float64)
 
 
 def towards(normal: np.ndarray, points: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -10,9 +10,10 @@ import pytest
 from analytic import MONO, MS, POL, RGB
 
 from mmsynth.errors import InputError
-from mmsynth.operations.output.records import UNITS, camera_from_json, camera_json, modality_arrays, read_record, write_record
+from mmsynth.operations.output.records import UNITS, modality_arrays, read_record, write_record
 from mmsynth.scene.images import read_image
-from mmsynth.scene.scene import Sensor
+from mmsynth.scene.scene import PosedCamera, Sensor
+from mmsynth.scene.serialisation import posed_from_json, posed_to_json
 from mmsynth.sensors.camera import Camera
 
 
@@ -77,5 +78,5 @@ def test_cameras_come_back() -> None:
         Camera(4, 3, 5.0, 6.0, 1.5, 1.0, (0.1, 0.2, 0.0, 0.01)),
         Camera(4, 3, 5.0, 6.0, 1.5, 1.0, (0.1, 0.0, 0.0, 0.0), "kannala_brandt"),
     ):
-        again, pose = camera_from_json(camera_json(camera, np.diag([1.0, -1.0, -1.0, 1.0])))
-        assert again == camera and np.array_equal(pose, np.diag([1.0, -1.0, -1.0, 1.0]))
+        again = posed_from_json(posed_to_json(PosedCamera(camera, np.diag([1.0, -1.0, -1.0, 1.0]))))
+        assert again.camera == camera and np.array_equal(again.camera_to_world, np.diag([1.0, -1.0, -1.0, 1.0]))

@@ -13,10 +13,9 @@ from analytic import MONO, RGB, AnalyticField, Distance, meets_ball, sphere
 from conftest import look_at, ring
 
 from mmsynth.errors import InputError
-from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, resized, training_rays, view_score, view_scores
-from mmsynth.operations.views.visibility import surface_points
+from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, training_rays, view_score, view_scores
 from mmsynth.scene.scene import Frame, Region, Scene, Split
-from mmsynth.sensors.camera import Camera, project, unproject
+from mmsynth.sensors.camera import Camera, project, resized, surface_points, unproject
 
 LENS = Camera(121, 91, 130.0, 128.0, 60.0, 45.0, (-0.12, 0.06, 0.002, -0.001))
 FISHEYE = Camera(121, 91, 110.0, 110.0, 60.0, 45.0, (0.02, -0.01, 0.0, 0.0), "kannala_brandt")

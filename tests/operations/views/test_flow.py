@@ -10,8 +10,7 @@ from conftest import look_at
 from scipy.spatial.transform import Rotation
 
 from mmsynth.operations.views.flow import optical_flow
-from mmsynth.operations.views.visibility import surface_points
-from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.camera import Camera, ray_map, surface_points
 
 PINHOLE = Camera(64, 48, 70.0, 68.0, 31.0, 24.5)
 BROWN = Camera(64, 48, 60.0, 61.0, 31.0, 24.5, (-0.2, 0.08, 0.004, -0.003, 0.01, 0.02, -0.01, 0.005))

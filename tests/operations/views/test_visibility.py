@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mmsynth.operations.views.visibility import SAME_SURFACE, hidden, inside, surface_points, towards
-from mmsynth.sensors.camera import Camera, project, ray_map, unproject
+from mmsynth.operations.views.visibility import SAME_SURFACE, hidden, inside, towards
+from mmsynth.sensors.camera import Camera, project, ray_map, surface_points, unproject
 
 CAMERA = Camera(40, 30, 35.0, 35.0, 19.5, 14.5)
 

@@ -1,0 +1,121 @@
+"""Options that several commands have, and the texts of options read into values."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mmsynth.errors import InputError
+
+RunOption = Annotated[Path | None, typer.Option("--run", help="run folder; default: the last fit made in this folder")]
+DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object on stdout and nothing else there")]
+SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="scene folder, or `example` for the packaged scene")]
+RecipeOption = Annotated[str | None, typer.Option(help="packaged recipe or TOML file")]
+ModalitiesOption = Annotated[str | None, typer.Option(help="fit these only, e.g. rgb,ms")]
+FramesOption = Annotated[str | None, typer.Option(help="training frames to keep of some modalities, e.g. pol=3,ms=5; default: all")]
+
+
+def modality_names(text: str | None) -> list[str] | None:
+    from mmsynth.scene.scene import canonical_modality
+
+    return None if text is None else [canonical_modality(n) for n in text.split(",") if n.strip()]
+
+
+def view_ids(text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    if not re.fullmatch(r"\d+(,\d+)*", text):
+        raise InputError(f"--views {text!r}: expected view ids such as 9,19.")
+    return tuple(int(v) for v in text.split(","))
+
+
+def poses_file(path: Path, folder: Path) -> Path:
+    """As given, else in the scene's folder."""
+    within = folder / path
+    return within if not path.exists() and within.exists() else path
+
+
+def frame_limits(text: str | None) -> dict[str, int]:
+    from mmsynth.scene.scene import canonical_modality
+
+    limits: dict[str, int] = {}
+    for part in text.split(",") if text is not None else ():
+        match = re.fullmatch(r"\s*([^=\s]+)\s*=\s*(\d+)\s*", part)
+        name = canonical_modality(match[1]) if match else ""
+        if not match or name in limits:
+            raise InputError(f"--frames {text!r}: expected a number of frames per modality, each once, such as pol=3,ms=5.")
+        limits[name] = int(match[2])
+    return limits
+
+
+def modality_pairs(text: str, known: list[str]) -> list[tuple[str, str]]:
+    from mmsynth.scene.scene import canonical_modality
+
+    if text == "all":
+        return [(a, b) for a in known for b in known if a != b]
+    if not re.fullmatch(r"[^:,\s]+:[^:,\s]+(,[^:,\s]+:[^:,\s]+)*", text):
+        raise InputError(f"--convert {text!r}: expected pairs such as rgb:ms or rgb:ms,mono:pol, or all.")
+    pairs = [part.split(":") for part in text.split(",")]
+    return [(canonical_modality(a), canonical_modality(b)) for a, b in pairs]
+
+
+def whole_numbers(text: str, option: str, example: str = "0,1") -> list[int]:
+    """Whole numbers joined by commas."""
+    if not re.fullmatch(r"\d+(,\d+)*", text):
+        raise InputError(f"{option} {text!r}: expected numbers such as {example}.")
+    return [int(number) for number in text.split(",")]
+
+
+def lengths(text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or not all(0 < x < float("inf") for x in found):
+        raise InputError(f"--distances {text!r}: expected lengths above 0 such as 0.001,0.002.")
+    return found
+
+
+def seconds_of(text: str, option: str = "--budget") -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|h)?", text.strip())
+    if not match or float(match[1]) <= 0:
+        raise InputError(f"{option} {text!r}: expected a time such as 60s, 5m or 1h.")
+    return float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2] or "s"]
+
+
+def fit_length(steps: int | None, budget: str | None, default: str | None = None) -> float | None:
+    """Seconds of a fit whose length is not given in steps."""
+    if steps is not None and budget is not None:
+        raise InputError("--steps and --budget: give one of the two.")
+    text = budget or default
+    return seconds_of(text) if text and steps is None else None
+
+
+def scene_path(text: str) -> Path:
+    from mmsynth.packaged import data_folder
+
+    path = Path(text)
+    return data_folder("example_scene") if text == "example" and not path.exists() else path
+
+
+def load_field(run: Path | None, device: str = "cpu") -> tuple[Path, Any]:
+    """Run folder and its field."""
+    from mmsynth.field.field import Field
+    from mmsynth.fitting.run_folders import chosen_run
+
+    path = chosen_run(run)
+    return path, Field.load(path, device)
+
+
+def load_run(run: Path | None, device: str = "cpu") -> tuple[Path, Any, Any]:
+    """Run folder, field, and the scene it was fitted to."""
+    from mmsynth.scene.load import load_scene
+
+    path, field = load_field(run, device)
+    return path, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))

@@ -1,0 +1,180 @@
+"""Commands about scenes and fields: info, fit, evaluate, batch, doctor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mmsynth.cli.arguments import (
+    DeviceOption,
+    FramesOption,
+    JsonOption,
+    ModalitiesOption,
+    RecipeOption,
+    RunOption,
+    SceneArgument,
+    fit_length,
+    frame_limits,
+    load_run,
+    modality_names,
+    modality_pairs,
+    scene_path,
+)
+from mmsynth.cli.terminal import command, progress_bar
+from mmsynth.errors import InputError
+
+
+@command("info")
+def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
+    """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
+    from mmsynth.scene.info import describe, render_text
+    from mmsynth.scene.load import load_scene
+
+    description = describe(load_scene(scene_path(scene)))
+    print(json.dumps(description) if as_json else render_text(description))
+
+
+@command("fit")
+def fit(
+    scene: SceneArgument,
+    run: RunOption = None,
+    recipe: RecipeOption = None,
+    modalities: ModalitiesOption = None,
+    frames: FramesOption = None,
+    budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
+    device: DeviceOption = "auto",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Learn the field of a scene."""
+    from mmsynth.fitting.needs import Needs
+    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
+    from mmsynth.fitting.trainer import Progress, pick_device
+    from mmsynth.fitting.trainer import fit as fit_field
+    from mmsynth.report.report import write_run_report
+    from mmsynth.scene.load import load_scene
+    from mmsynth.scene.scene import keep_frames
+
+    seconds = fit_length(steps, budget)
+    loaded = keep_frames(load_scene(scene_path(scene), modality_names(modalities)), frame_limits(frames))
+    name = loaded.root.resolve().name
+    folder = run or (run_to_resume(name) if resume else new_run(name))
+
+    def say(text: str) -> None:
+        if not as_json:
+            print(text)
+
+    for problem in loaded.problems:
+        say(f"note: {problem}")
+    with progress_bar("fit", as_json) as show:
+
+        def on_step(news: Progress) -> None:
+            psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
+            show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
+
+        told: set[str] = set()
+
+        def explain(evidence: dict[str, str]) -> None:
+            for what, why in evidence.items():
+                if what not in told:
+                    say(f"needs {what}: {why}")
+            told.update(evidence)
+
+        def on_start(needs: Needs) -> None:
+            explain(needs.evidence)
+
+        field = fit_field(
+            loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume, on_start=on_start, on_step=on_step
+        )
+        explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
+    write_run_report(folder, field, scene=loaded)
+    mark_latest(folder)
+    facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
+    if as_json:
+        print(json.dumps(facts))
+        return
+    shown = ", ".join(f"{n} {v:.1f}" for n, v in facts["train_psnr"].items())
+    print(f"{facts['steps']} steps in {facts['seconds']['fit']:.0f} s, {facts['rays_per_s']:,.0f} rays/s")
+    print(f"PSNR on training pixels [dB]: {shown}")
+    print(f"wrote {folder}/ (field.safetensors, manifest.json, preview.png, report.html)")
+
+
+@command("evaluate")
+def evaluate(
+    run: RunOption = None,
+    convert: Annotated[
+        str | None, typer.Option(help="score conversions instead, e.g. rgb:ms or rgb:ms,mono:pol; all: every pair", metavar="FROM:TO")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Score the test views."""
+    from mmsynth.operations.evaluation.evaluate import evaluate as score
+    from mmsynth.report.report import write_run_report
+    from mmsynth.report.text import conversion_text, score_text
+
+    folder, field, scene = load_run(run)
+    if convert is not None:
+        from mmsynth.operations.evaluation.conversions import evaluate_conversion
+
+        pairs = modality_pairs(convert, list(field.sensors))
+        found = []
+        with progress_bar("evaluate", as_json) as show:
+            for done, (a, b) in enumerate(pairs):
+                found.append(evaluate_conversion(field, scene, a, b))
+                show(done + 1, len(pairs))
+        print(json.dumps({"conversions": found}) if as_json else conversion_text(found))
+        return
+    with progress_bar("evaluate", as_json) as show:
+        scores = score(field, scene, progress=show)
+    write_run_report(folder, field, scores, scene=scene)
+    print(json.dumps(scores) if as_json else score_text(scores))
+
+
+@command("batch")
+def batch(
+    scenes: Annotated[Path, typer.Argument(help="text file, one scene folder a line")],
+    poses: Annotated[Path | None, typer.Option(help="of a dataset of each, as for generate-dataset; none: only fits")] = None,
+    recipe: RecipeOption = None,
+    modalities: ModalitiesOption = None,
+    budget: Annotated[str | None, typer.Option(help="time of each fit, e.g. 60s or 5m")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="or its optimiser steps")] = None,
+    rig: Annotated[str, typer.Option(help="aligned or native")] = "aligned",
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr, tiff, webdataset or mms-data")] = "npz",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    device: DeviceOption = "auto",
+    out: Annotated[Path, typer.Option(help="results of each scene go into OUT/NAME")] = Path("batch"),
+    as_json: JsonOption = False,
+) -> None:
+    """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
+    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.operations.output.work_partition import share_of_environment
+    from mmsynth.workflows.batch import Job, read_scene_list, run_batch
+
+    seconds = fit_length(steps, budget)
+    listed, share = read_scene_list(scenes), share_of_environment()
+    names = modality_names(modalities)
+    job = Job(
+        load_recipe(recipe), steps, seconds, seed, pick_device(device), None if names is None else tuple(names), poses, rig, file_format
+    )
+    outcomes = run_batch(listed, out, job, share, say=(lambda text: None) if as_json else print)
+    if as_json:
+        print(json.dumps({"out": str(out), "scenes": outcomes}))
+    failed = [name for name, outcome in outcomes.items() if "error" in outcome]
+    if failed:
+        raise InputError(f"batch: {len(failed)} of {len(outcomes)} scenes failed, first: {outcomes[failed[0]]['error']}")
+
+
+@command("doctor")
+def doctor(as_json: JsonOption = False) -> None:
+    """Versions, threads, GPU, kernels, and what to do."""
+    from mmsynth.bench.doctor import diagnose, render_text
+
+    facts = diagnose()
+    print(json.dumps(facts) if as_json else render_text(facts))

@@ -1,0 +1,259 @@
+"""Commands that make something of a field: convert, generate-dataset, simulate, calibrate-noise, mesh."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, load_field, load_run, modality_names, poses_file, view_ids
+from mmsynth.cli.terminal import command, print_written, progress_bar
+from mmsynth.errors import InputError
+
+
+@command("convert")
+def convert(
+    source: Annotated[str, typer.Option("--from", help="modality whose frames give pose and pixel grid")],
+    target: Annotated[str, typer.Option("--to", help="modality to synthesise")],
+    run: RunOption = None,
+    views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
+    method: Annotated[str, typer.Option(help="auto, field, ratio or guided")] = "auto",
+    images: Annotated[
+        list[Path] | None, typer.Option(help="frames of the source, once per file: found by what they show, or at --poses by their names")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="poses of the source, as for generate-dataset; without --images the field alone is rendered")
+    ] = None,
+    as_sensor: Annotated[
+        bool, typer.Option("--as-sensor", help="from the target's own place, through its lens; else on the source's pixels")
+    ] = False,
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
+    out: Annotated[Path | None, typer.Option(help="default: RUN/convert/FROM_to_TO")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Another modality at the poses of the frames of one, or at any poses."""
+    from mmsynth.operations.conversion.files import convert_at_poses, convert_frames, convert_images
+    from mmsynth.operations.views.trajectories import load_views
+    from mmsynth.scene.scene import canonical_modality
+
+    folder, field, scene = load_run(run)
+    a, b = canonical_modality(source), canonical_modality(target)
+    if views is not None and (images or poses):
+        raise InputError("--views: frames of the scene are converted with it, expected it without --images and --poses.")
+    chosen = view_ids(views)
+    destination = out or folder / "convert" / f"{a}_to_{b}"
+    with progress_bar(f"{a} to {b}", as_json) as show:
+        if poses is not None:
+            at = load_views(poses_file(poses, scene.root), field, scene, a)
+            written = convert_at_poses(field, scene, a, b, at, destination, images or [], method, as_sensor, file_format, show)
+        elif images:
+            written = convert_images(field, scene, a, b, images, destination, method, as_sensor, file_format, show)
+        else:
+            written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, file_format, show)
+    print_written(destination, written, as_json)
+
+
+@command("generate-dataset")
+def generate_dataset(
+    poses: Annotated[
+        Path,
+        typer.Option(
+            help="transforms.json, camera_path.json, images.txt, meta_data.json, TUM or a trajectory; sought here, then in the scene"
+        ),
+    ] = Path("poses.json"),
+    run: RunOption = None,
+    rig: Annotated[
+        str, typer.Option(help="aligned: all modalities on one camera; native: each sensor at its place on the rig")
+    ] = "aligned",
+    modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
+    outputs: Annotated[
+        str | None, typer.Option(help="beside the modalities: some of geometry,flow,coverage, or none; default: all", metavar="NAMES")
+    ] = None,
+    min_coverage: Annotated[
+        float | None, typer.Option(help="leave out views that the training frames cover less; 1 = their own pixels")
+    ] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="also raw frames of this sensor file or packaged sensor, once per sensor; into OUT/raw")
+    ] = None,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="also raw frames of the field's own sensors, as calibrate-noise found them (RUN/sensors)")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="of the raw frames' noise")] = 0,
+    out: Annotated[Path | None, typer.Option(help="default: RUN/dataset")] = None,
+    file_format: Annotated[str, typer.Option("--format", help="npz, exr, tiff, webdataset or mms-data")] = "npz",
+    device: DeviceOption = "auto",
+    verify: Annotated[bool, typer.Option("--verify", help="only check a finished dataset against its checksums")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """An aligned dataset: every modality, depth, normals, opacity, coverage, flow, intrinsics and pose per view. Under torchrun every
+    process makes its share."""
+    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.operations.dataset import generate as dataset
+    from mmsynth.operations.dataset import index as dataset_index
+    from mmsynth.operations.output.work_partition import local_device, share_of_environment
+    from mmsynth.operations.views.coverage import covered_views, training_rays, view_scores
+    from mmsynth.operations.views.trajectories import load_views
+
+    if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
+        raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
+    share = share_of_environment()
+    folder, field, scene = load_run(run, local_device(pick_device(device)))
+    destination = out or folder / "dataset"
+    if verify:
+        problems = dataset_index.verify(destination)
+        if problems:
+            raise InputError(f"{destination}: {len(problems)} problems, first: {problems[0]}")
+        print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")
+        return
+    views = load_views(poses_file(poses, scene.root), field, scene)
+    names = modality_names(modalities)
+    wanted = None if outputs is None else [] if outputs == "none" else [name.strip() for name in outputs.split(",")]
+    sensors = [*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)]
+    rays = None
+    if min_coverage is not None or wanted is None or "coverage" in wanted:
+        with progress_bar("training rays", as_json) as show:
+            rays = training_rays(field, scene, progress=show)
+    left_out: list[tuple[str, float]] = []
+    if min_coverage is not None:
+        given = len(views)
+        assert rays is not None
+        with progress_bar("coverage", as_json) as show:
+            scores = view_scores(field, rays, views, progress=show)
+        views, left_out = covered_views(views, scores, min_coverage)
+        if left_out and not as_json:
+            named = ", ".join(f"{name} ({score:.2f})" for name, score in left_out)
+            print(f"left out {len(left_out)} of {given} views with a coverage below {min_coverage:g}: {named}")
+    with progress_bar("dataset", as_json) as show:
+        written = dataset.generate_dataset(
+            field, views, destination, names, rig, file_format, wanted, rays, sensors, seed, share, progress=show
+        )
+    unseen = [{"name": name, "coverage_score": score} for name, score in left_out]
+    facts = {"dataset": None if written is None else str(written), "views": len(views), "left_out": unseen}
+    if as_json:
+        print(json.dumps(facts))
+    elif written is None:
+        print(f"process {share.number} of {share.processes}: its share of {len(views)} views is in {destination}/, others are at work")
+    else:
+        print(f"wrote {len(views)} views into {destination}/")
+
+
+@command("simulate")
+def simulate(
+    sensor: Annotated[list[str], typer.Option(help="sensor file, or the name of a packaged one; once per sensor of the rig")],
+    poses: Annotated[Path | None, typer.Option(help="of the rig's reference: as for generate-dataset")] = None,
+    views: Annotated[str | None, typer.Option(help="instead: at frames of the scene, train, test, all or ids, e.g. 9,19")] = None,
+    run: RunOption = None,
+    rig: Annotated[str, typer.Option(help="native: each sensor at its place on the rig; aligned: all at the poses")] = "native",
+    delta: Annotated[
+        bool, typer.Option("--delta", help="of captured sensors: apply the file's effects on top of what the field has")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="of noise and fixed patterns")] = 0,
+    file_format: Annotated[str, typer.Option("--format", help="png, tiff or dng")] = "png",
+    out: Annotated[Path | None, typer.Option(help="default: RUN/simulated")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The sensor's digital twin: raw frames as it would have recorded them, a scene that can be fitted again."""
+    from mmsynth.operations.output.work_partition import share_of_environment
+    from mmsynth.operations.simulation import simulate as twins
+    from mmsynth.operations.views.trajectories import load_views
+
+    if (poses is None) == (views is None):
+        raise InputError("simulate: give one of --poses and --views.")
+    share = share_of_environment()
+    folder, field, scene = load_run(run)
+    destination = out or folder / "simulated"
+    with progress_bar("simulate", as_json) as show:
+        if poses is not None:
+            at = load_views(poses_file(poses, scene.root), field, scene)
+            written = twins.simulate(field, sensor, at, destination, seed, file_format, rig, delta, share, show)
+        else:
+            if rig != "native":
+                raise InputError("--rig: frames of the scene have their sensors' own poses, expected it with --poses.")
+            split = {"train": scene.split.train, "test": scene.split.test, "all": None}
+            chosen = split[views] if views in split else view_ids(views)
+            written = twins.simulate_at_frames(field, scene, sensor, destination, chosen, seed, file_format, delta, share, show)
+    if as_json:
+        print(json.dumps({"scene": str(destination)}))
+        return
+    if written is None:
+        print(f"process {share.number} of {share.processes}: its share of the frames is in {destination}/, others are at work")
+        return
+    for line in twins.foretold(written.parent):
+        print(line)
+    print(f"wrote {written.parent}/ ({written.name}, modalities, sidecars, sensors)")
+
+
+@command("calibrate-noise")
+def calibrate_noise(
+    frames: Annotated[
+        list[Path] | None, typer.Argument(metavar="[FRAME]...", help="raw files of the one --sensor: no field needed")
+    ] = None,
+    run: RunOption = None,
+    modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="sensor files that say bits, black level and alignment; default: what the frames use")
+    ] = None,
+    raw: Annotated[Path | None, typer.Option(help="other frames at the same poses, of any exposure: RAW/MODALITY/0009.png")] = None,
+    views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: those of the training")] = None,
+    out: Annotated[Path | None, typer.Option(help="default: RUN/sensors, or sensors")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Gain, read noise and PRNU from photon transfer, into sensor files; from a scene's frames and its field, or from frames alone."""
+    from mmsynth.operations.simulation import calibrate_noise as noise
+    from mmsynth.report.text import noise_text
+    from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
+
+    files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
+    untold: dict[str, str] = {}
+    if frames:
+        if len(files) != 1:
+            raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
+        found, destination = {files[0].name: noise.calibrate_from_frames(files[0], frames)}, out or Path("sensors")
+    else:
+        folder, field, scene = load_run(run)
+        known = noise.by_modality(files)
+        with progress_bar("noise", as_json) as show:
+            found, untold = noise.calibrate_noise(field, scene, modality_names(modalities), known, raw, view_ids(views), progress=show)
+        destination = out or folder / "sensors"
+    if found:
+        noise.write(found, destination)
+        facts = {"out": str(destination), "sensors": {n: c.to_json() for n, c in found.items()}}
+        print(json.dumps(facts) if as_json else noise_text(found))
+        if not as_json:
+            print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
+    if untold:
+        raise InputError(" ".join(untold.values()))
+
+
+@command("mesh")
+def mesh(
+    run: RunOption = None,
+    resolution: Annotated[int, typer.Option(min=8, max=8192, help="cells across the region of interest")] = 256,
+    out: Annotated[Path | None, typer.Option(help="PLY, GLB, OBJ or STL; default: RUN/mesh.ply")] = None,
+    closed: Annotated[bool, typer.Option("--closed", help="close the surface where the region's border cuts it")] = False,
+    keep: Annotated[str, typer.Option(help="components: clean (no specks), all, largest, or how many")] = "clean",
+    min_views: Annotated[int, typer.Option(min=0, help="keep components only that so many training views see")] = 0,
+    faces: Annotated[int | None, typer.Option(min=4, help="decimate to so many")] = None,
+    max_error: Annotated[float | None, typer.Option(help="or as far as 99.9 % of it stays that near [unit]")] = None,
+    geometry_only: Annotated[bool, typer.Option("--geometry-only", help="no colours and no modalities on the vertices")] = False,
+    against: Annotated[Path | None, typer.Option(help="score it against this mesh, in the same frame and unit")] = None,
+    distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002; default: 0.5, 1 and 2 % of the radius")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The surface with every modality on it, in the input's frame and unit."""
+    from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
+    from mmsynth.report.text import mesh_text
+
+    if geometry_only and not min_views and against is None:
+        (folder, field), scene = load_field(run), None  # the scene may be elsewhere
+    else:
+        folder, field, scene = load_run(run)
+    destination, at = out or folder / "mesh.ply", lengths(distances)
+    options = MeshOptions(
+        resolution, keep=keep_of(keep), closed=closed, attributes=not geometry_only, min_views=min_views, faces=faces, max_error=max_error
+    )
+    with progress_bar("mesh", as_json) as show:
+        report = mesh_to_file(field, destination, options, scene=scene, against=against, distances=at, progress=show)
+    print(json.dumps(report) if as_json else mesh_text(report))
