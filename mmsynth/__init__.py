@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from mmsynth.operations.dataset.aligned import AlignedDataset
     from mmsynth.operations.dataset.generate import generate_dataset
     from mmsynth.operations.evaluation.evaluate import evaluate
-    from mmsynth.operations.mesh.extract import extract_mesh, write_mesh
+    from mmsynth.operations.mesh.extract import extract_mesh
+    from mmsynth.operations.mesh.files import write_mesh
     from mmsynth.operations.simulation.calibrate_noise import calibrate_noise
     from mmsynth.operations.simulation.simulate import simulate
     from mmsynth.scene.load import load_scene
@@ -45,7 +46,7 @@ _HOMES = {
     "generate_dataset": "operations.dataset.generate",
     "evaluate": "operations.evaluation.evaluate",
     "extract_mesh": "operations.mesh.extract",
-    "write_mesh": "operations.mesh.extract",
+    "write_mesh": "operations.mesh.files",
     "load_scene": "scene.load",
     "simulate": "operations.simulation.simulate",
 }

@@ -57,7 +57,7 @@ def fit(
     from mmsynth.fitting.run import fit as fit_field
     from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
     from mmsynth.fitting.trainer import FitProgress
-    from mmsynth.report.report import write_report
+    from mmsynth.report.report import write_run_report
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
 
@@ -102,7 +102,7 @@ def fit(
             on_step=on_step,
         )
         explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
-    write_report(folder, field, scene=loaded)
+    write_run_report(folder, field, scene=loaded)
     mark_latest(folder)
     facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
     if as_json:
@@ -124,7 +124,7 @@ def evaluate(
 ) -> None:
     """Score the test views."""
     from mmsynth.operations.evaluation.evaluate import evaluate as score
-    from mmsynth.report.report import write_report
+    from mmsynth.report.report import write_run_report
     from mmsynth.report.text import conversion_text, score_text
 
     folder, field, scene = load_run(run)
@@ -141,7 +141,7 @@ def evaluate(
         return
     with progress_bar("evaluate", as_json) as show:
         scores = score(field, scene, progress=show)
-    write_report(folder, field, scores, scene=scene)
+    write_run_report(folder, field, scores, scene=scene)
     print(json.dumps(scores) if as_json else score_text(scores))
 
 

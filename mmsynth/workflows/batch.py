@@ -16,7 +16,7 @@ from mmsynth.fitting.run import fit
 from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.output.work_partition import Share, local_device
 from mmsynth.operations.views.trajectories import load_views
-from mmsynth.report.report import write_report
+from mmsynth.report.report import write_run_report
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 
@@ -111,5 +111,5 @@ def _fitted(scene: Scene, run: Path, job: Job) -> Field:
     resume = (run / "checkpoint/state.pt").is_file()
     device = local_device(job.device)
     field = fit(scene, run, recipe=job.recipe, steps=job.steps, budget=job.seconds, seed=job.seed, device=device, resume=resume)
-    write_report(run, field, scene=scene)
+    write_run_report(run, field, scene=scene)
     return field
