@@ -52,12 +52,12 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
-    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.fitting.run import fit as fit_field
     from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
-    from mmsynth.fitting.trainer import Progress, pick_device
-    from mmsynth.fitting.trainer import fit as fit_field
-    from mmsynth.report.report import write_report
+    from mmsynth.fitting.trainer import FitProgress
+    from mmsynth.report.report import write_run_report
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
 
@@ -74,7 +74,7 @@ def fit(
         say(f"note: {problem}")
     with progress_bar("fit", as_json) as show:
 
-        def on_step(news: Progress) -> None:
+        def on_step(news: FitProgress) -> None:
             psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
             show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
 
@@ -90,10 +90,19 @@ def fit(
             explain(needs.evidence)
 
         field = fit_field(
-            loaded, folder, load_recipe(recipe), steps, seconds, seed, pick_device(device), resume, on_start=on_start, on_step=on_step
+            loaded,
+            folder,
+            recipe=recipe,
+            steps=steps,
+            budget=seconds,
+            seed=seed,
+            device=pick_device(device),
+            resume=resume,
+            on_start=on_start,
+            on_step=on_step,
         )
         explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
-    write_report(folder, field, scene=loaded)
+    write_run_report(folder, field, scene=loaded)
     mark_latest(folder)
     facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
     if as_json:
@@ -115,7 +124,7 @@ def evaluate(
 ) -> None:
     """Score the test views."""
     from mmsynth.operations.evaluation.evaluate import evaluate as score
-    from mmsynth.report.report import write_report
+    from mmsynth.report.report import write_run_report
     from mmsynth.report.text import conversion_text, score_text
 
     folder, field, scene = load_run(run)
@@ -132,7 +141,7 @@ def evaluate(
         return
     with progress_bar("evaluate", as_json) as show:
         scores = score(field, scene, progress=show)
-    write_report(folder, field, scores, scene=scene)
+    write_run_report(folder, field, scores, scene=scene)
     print(json.dumps(scores) if as_json else score_text(scores))
 
 
@@ -152,8 +161,8 @@ def batch(
     as_json: JsonOption = False,
 ) -> None:
     """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.fitting.trainer import pick_device
     from mmsynth.operations.output.work_partition import share_of_environment
     from mmsynth.workflows.batch import Job, read_scene_list, run_batch
 

@@ -14,8 +14,9 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.operations.conversion.files import source_views
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
@@ -89,7 +90,7 @@ def test_exact_poses_are_left_alone(scene: Scene) -> None:
 @pytest.mark.parametrize(("views", "sensors"), [(1.5, 0.0), (0.0, 1.5)])
 def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, views: float, sensors: float) -> None:
     off = _disturbed(scene, views, sensors)
-    field = fit(off, tmp_path, _recipe(), steps=STEPS)
+    field = fit(off, tmp_path, recipe=_recipe(), steps=STEPS)
     evidence = field.manifest["needs"]["evidence"]
     assert evidence["poses"].startswith("on" if views else "off") and evidence["rig"].startswith("on" if sensors else "off"), evidence
     assert _pixels_off(off, field, scene) < 0.5 * _pixels_off(off, None, scene)
@@ -172,7 +173,7 @@ def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
 
 
 def test_the_evidence_is_in_the_manifest_and_the_checkpoint(scene: Scene, tmp_path: Path) -> None:
-    fit(scene, tmp_path, _recipe(), steps=60)
+    fit(scene, tmp_path, recipe=_recipe(), steps=60)
     evidence = json.loads((tmp_path / "manifest.json").read_text())["needs"]["evidence"]
     saved = read_checkpoint(tmp_path)
     assert saved is not None
