@@ -107,7 +107,7 @@ def _field() -> Inputs:
         torch.manual_seed(0)
         surface, appearance = Surface(HashGrid(_LEVELS[0], 16, 16, 128), 32, (0.5, 4.0)), HashGrid(_LEVELS[1], 17, 16, 256)
         nn.init.normal_(surface.grid.table, std=0.05)
-        nn.init.normal_(surface.last, std=0.1)
+        nn.init.normal_(surface.output_weight, std=0.1)
         nn.init.normal_(appearance.table)
         occupancy = Occupancy(64)
         occupancy.update(lambda x: surface.reference(x, _LEVELS[0]), _SAMPLING.sharpness, _generator(), 1.0)

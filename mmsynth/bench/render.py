@@ -115,14 +115,18 @@ def rays_of(field: Field, scene: Scene) -> Rays:
         directions, valid = ray_map(frame.camera)
         height, width = valid.shape
         rows = np.unique(np.linspace(0, height - 1, min(height, max(1, RAYS // len(chosen) // width))).round().astype(int))
-        parts.append(field.placed(directions[rows][valid[rows]], field.pose_of(frame)))
+        parts.append(field.rays_of(directions[rows][valid[rows]], field.pose_of(frame)))
     return Rays(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
 
 def fine(sampling: Sampling, coarser: float = 1.0) -> Sampling:
     """The sampling of the reference, or one of a longer step."""
     return dataclasses.replace(
-        sampling, opaque=FINE_OPAQUE, step=sampling.step * FINE_STEP * coarser, stride=FINE_STRIDE * coarser, significant=0.0
+        sampling,
+        max_optical_depth=FINE_OPAQUE,
+        step=sampling.step * FINE_STEP * coarser,
+        sphere_step_factor=FINE_STRIDE * coarser,
+        min_section_weight=0.0,
     )
 
 
@@ -146,7 +150,7 @@ def _exact(field: Field, rays: Rays, sampling: Sampling) -> tuple[Outputs, float
         )  # fmt: skip
         hits = rendering.composite(surface, field.appearance, origins, directions, taken, sampling)
         samples += int(hits.samples)
-        parts.append(field.shown(hits, origins, directions, camera_x, list(field.sensors), True))
+        parts.append(field.shade_hits(hits, origins, directions, camera_x, list(field.sensors), True))
     return _joined(parts), samples / len(rays)
 
 
@@ -215,9 +219,9 @@ def _samples(bed: Bed, way: Way) -> float:
 def termination(bed: Bed) -> list[Way]:
     """The optical depth at which a ray ends."""
     s = bed.field.sampling
-    values = sorted({1.0, 2.0, 3.0, 5.0, 8.0, s.opaque})
+    values = sorted({1.0, 2.0, 3.0, 5.0, 8.0, s.max_optical_depth})
     return [
-        Way(problem, f"opaque {v:g}{_own(v == s.opaque)}", names, dataclasses.replace(s, opaque=v))
+        Way(problem, f"max_optical_depth {v:g}{_own(v == s.max_optical_depth)}", names, dataclasses.replace(s, max_optical_depth=v))
         for problem, names in bed.sets.items()
         for v in values
     ]
@@ -227,7 +231,7 @@ def steps(bed: Bed) -> list[Way]:
     """How a ray is sampled: the step at the surface, the stride towards it, and how much a section weighs that has its own appearance."""
     s = bed.field.sampling
     variants: list[tuple[str, dict[str, float]]] = [(f"step x {v:g}{_own(v == 1.0)}", {"step": v * s.step}) for v in (0.5, 1.0, 2.0, 4.0)]
-    for name, values in (("stride", (0.4, 0.7, 0.9)), ("significant", (0.0, 1e-2, 5e-2))):
+    for name, values in (("sphere_step_factor", (0.4, 0.7, 0.9)), ("min_section_weight", (0.0, 1e-2, 5e-2))):
         own = getattr(s, name)
         variants += [(f"{name} {v:g}{_own(v == own)}", {name: v}) for v in sorted({*values, own})]
     return [

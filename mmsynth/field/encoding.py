@@ -60,7 +60,7 @@ class HashGrid(nn.Module):
         self.table.data, self.table.grad = torch.cat([self.table.data[:kept], fresh.to(self.table.device)]), None
         return kept
 
-    def place(self, points: Tensor) -> Tensor:
+    def to_grid(self, points: Tensor) -> Tensor:
         """Points of the normalised frame in the grid's own: contracted space where it is wider than the region."""
         return kernels.contract(points) if self.extent > 1.0 else points
 

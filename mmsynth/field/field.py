@@ -77,8 +77,8 @@ class Design:
     radiance_rows_log2: int | tuple[int, ...] = 16
     radiance_finest: int = 256
     background: bool = False
-    beyond: bool = False
-    horizon: float = 1.9
+    far_light: bool = False
+    outer_radius: float = 1.9
     surface_hidden: int = 32
     radiance_hidden: int = 64
     coarsest: int = 16
@@ -97,7 +97,7 @@ class Field(nn.Module):
         rig: sensor → (4, 4) sensor_to_reference, scene unit; the reference is the first sensor.
         sampling: how finely it is rendered. manifest: everything known about the fit.
         view_dependence: degree of the spherical harmonics of each modality's radiance.
-        beyond: (F,) features of the light that passes the region, None where that is black or the background is modelled.
+        far_light: (F,) features of the light that passes the region, None where that is black or the background is modelled.
         corrections: of the poses of the scene's frames (see ``pose_of``); the rig has them already.
     """
 
@@ -105,7 +105,7 @@ class Field(nn.Module):
         self,
         design: Design,
         sensors: dict[str, Sensor],
-        levels: dict[str, float],
+        radiance_scale: dict[str, float],
         region: Region,
         unit: str = "input unit",
         cameras: dict[str, Camera] | None = None,
@@ -113,19 +113,19 @@ class Field(nn.Module):
     ) -> None:
         super().__init__()
         d = self.design = design
-        self.sensors, self.levels, self.region, self.unit = sensors, levels, region, unit
+        self.sensors, self.radiance_scale, self.region, self.unit = sensors, radiance_scale, region, unit
         self.cameras, self.rig = cameras or {}, rig or {}
         self.view_dependence = dict.fromkeys(sensors, 0)
         self.corrections = Corrections({}, {})
         self.manifest: dict[str, Any] = {}
         extent = 2.0 if d.background else 1.0
-        spheres = (d.initial_radius, d.horizon if d.background else 1e9)
+        spheres = (d.initial_radius, d.outer_radius if d.background else 1e9)
         self.surface = Surface(
             HashGrid(d.surface_levels, d.surface_rows_log2, d.coarsest, d.surface_finest, extent), d.surface_hidden, spheres
         )
         self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest, extent)
-        self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, levels)
-        self.beyond = nn.Parameter(torch.zeros(self.appearance.width)) if d.beyond else None
+        self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, radiance_scale)
+        self.far_light = nn.Parameter(torch.zeros(self.appearance.width)) if d.far_light else None
         self.occupancy = Occupancy(d.occupancy, extent)
         self.sampling = Sampling(20.0, 0.05, d.surface_levels, d.radiance_levels)
 
@@ -162,19 +162,19 @@ class Field(nn.Module):
         unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
 
-    def to_shade(self, hits: rendering.Hits) -> tuple[Tensor, Tensor]:
+    def with_far_light(self, hits: rendering.Hits) -> tuple[Tensor, Tensor]:
         """Features (R, F) and opacity (R,) of what is shaded. Light from beyond the region has features, too, and no place: only a
         direction; where it is modelled, no ray ends in the dark."""
-        if self.beyond is None:
+        if self.far_light is None:
             return hits.features, hits.opacity
         passed = (1.0 - hits.opacity)[:, None]
-        return hits.opacity[:, None] * hits.features + passed * self.beyond, torch.ones_like(hits.opacity)
+        return hits.opacity[:, None] * hits.features + passed * self.far_light, torch.ones_like(hits.opacity)
 
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
         """Signed distance in the scene's unit, positive outside: (N, 3) → (N,) float32. Of contracted space, where it is."""
         parts = self.to_normalised(points).split(65536)
-        values = [self.surface(self.surface.grid.place(part), self.sampling.active_surface) for part in parts]
+        values = [self.surface(self.surface.grid.to_grid(part), self.sampling.active_surface) for part in parts]
         return torch.cat(values).cpu().numpy() * np.float32(self.region.radius) if values else np.empty(0, np.float32)
 
     @torch.no_grad()
@@ -187,14 +187,14 @@ class Field(nn.Module):
         """
         jitter = torch.full((len(origins),), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
-        return self.shown(hits, origins, directions, camera_x, modalities, geometry)
+        return self.shade_hits(hits, origins, directions, camera_x, modalities, geometry)
 
     @torch.no_grad()
-    def shown(
+    def shade_hits(
         self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
-        features, opacity = self.to_shade(hits)
+        features, opacity = self.with_far_light(hits)
         opacity = opacity[:, None]
         outputs = {d: self.shader(features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
         # a background is opaque, too, but what lies there is not the object
@@ -217,7 +217,7 @@ class Field(nn.Module):
             normal = torch.full_like(directions, float("nan"))
             epsilon = self.surface.grid.cell(self.sampling.active_surface)
             points = origins[hit] + directions[hit] * depth[hit, None]
-            slope = self.surface.gradient(self.surface.grid.place(points), epsilon, self.sampling.active_surface)
+            slope = self.surface.gradient(self.surface.grid.to_grid(points), epsilon, self.sampling.active_surface)
             if self.surface.grid.extent > 1.0:
                 slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
@@ -226,9 +226,9 @@ class Field(nn.Module):
 
     def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
         """``render_rays`` of rays of one camera: directions (R, 3) in its axes, scene frame; depth stays in radii."""
-        return {k: x.cpu().numpy() for k, x in self.render_rays(*self.placed(directions, camera_to_world), modalities, geometry).items()}
+        return {k: x.cpu().numpy() for k, x in self.render_rays(*self.rays_of(directions, camera_to_world), modalities, geometry).items()}
 
-    def placed(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    def rays_of(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""
         turned = torch.from_numpy((directions @ camera_to_world[:3, :3].T).astype(np.float32)).to(self.device)
         origin = self.to_normalised(camera_to_world[:3, 3]).expand(len(turned), 3)
@@ -305,7 +305,7 @@ class Field(nn.Module):
         self.manifest["field"] = {
             "design": asdict(self.design),
             "sampling": asdict(self.sampling),
-            "levels": self.levels,
+            "radiance_scale": self.radiance_scale,
             "view_dependence": self.view_dependence,
             "region": asdict(self.region),
             "unit": self.unit,
@@ -338,7 +338,7 @@ class Field(nn.Module):
             cameras = {n: camera_from_json(c) for n, c in stored["cameras"].items()}
             rig = {n: np.array(m) for n, m in stored["rig"].items()}
             sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored["design"].items()}
-            field = Field(Design(**sizes), sensors, stored["levels"], region, stored["unit"], cameras, rig)
+            field = Field(Design(**sizes), sensors, stored["radiance_scale"], region, stored["unit"], cameras, rig)
             field.sampling = Sampling(**stored["sampling"])
             field.view_dependence = dict(stored["view_dependence"])
             moved = stored["corrections"]

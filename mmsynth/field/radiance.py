@@ -17,13 +17,13 @@ class Shader(nn.Module):
 
     A radiance modality has one output per channel, made positive by softplus. A polarization modality has six: the Cholesky
     factor of a world-space coherency tensor J = L Lᵀ, so that DoLP ≤ 1 and no reference direction exists (see
-    sensors.polarization). ``levels`` holds each modality's typical value: outputs are relative to it, so dark sensors learn
+    sensors.polarization). ``radiance_scale`` holds each modality's typical value: outputs are relative to it, so dark sensors learn
     as fast as bright ones.
     """
 
     term_degree: Tensor
 
-    def __init__(self, features: int, hidden: int, sensors: dict[str, Sensor], levels: dict[str, float]) -> None:
+    def __init__(self, features: int, hidden: int, sensors: dict[str, Sensor], radiance_scale: dict[str, float]) -> None:
         super().__init__()
         self.trunk = nn.Sequential(nn.Linear(features + 16, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
         self.columns: dict[str, slice] = {}
@@ -32,7 +32,7 @@ class Shader(nn.Module):
             self.columns[name] = slice(width, width + (6 if sensor.is_polarization else sensor.channel_count))
             width = self.columns[name].stop
         self.heads = nn.Linear(hidden, width)
-        self.levels = levels
+        self.radiance_scale = radiance_scale
         self.register_buffer("term_degree", torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7), persistent=False)
 
     def forward(self, features: Tensor, directions: Tensor, degree: Tensor | int) -> Tensor:
@@ -52,7 +52,7 @@ class Shader(nn.Module):
 
     def values(self, modality: str, outputs: Tensor) -> Tensor:
         """All channels of one radiance modality, linear and ≥ 0: (R, outputs) → (R, C)."""
-        return radiance(outputs[:, self.columns[modality]]) * self.levels[modality]
+        return radiance(outputs[:, self.columns[modality]]) * self.radiance_scale[modality]
 
     def polarized(self, modality: str, outputs: Tensor, x: Tensor, y: Tensor, angles: Tensor) -> tuple[Tensor, Tensor]:
         """All channels of one polarization modality, I = eᵀ J e behind analysers that all rays share, and the Stokes vectors.
@@ -67,7 +67,7 @@ class Shader(nn.Module):
         across, up = (torch.stack([x, y], 1) @ factor).unbind(1)
         behind = (torch.cos(angles)[:, None, None] * across + torch.sin(angles)[:, None, None] * up).square().sum(-1).T
         xx, yy, xy = across.square().sum(-1), up.square().sum(-1), (across * up).sum(-1)
-        return behind * self.levels[modality], torch.stack([xx + yy, xx - yy, 2.0 * xy], -1) * self.levels[modality]
+        return behind * self.radiance_scale[modality], torch.stack([xx + yy, xx - yy, 2.0 * xy], -1) * self.radiance_scale[modality]
 
 
 def radiance(raw: Tensor) -> Tensor:

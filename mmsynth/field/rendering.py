@@ -28,20 +28,20 @@ class Sampling:
     Attributes:
         sharpness: s of the surface; its soft part is about 3.5 / s thick. step: between samples at the surface, in contracted
             space. active_surface, active_radiance: levels of the grids.
-        stride: share of the free distance that a ray goes at once, away from the surface.
-        grazing: a ray that approaches the surface at less than this slope steps as if it had it.
-        significant: sections of a smaller weight are given no appearance of their own.
-        opaque: optical depth at which a ray ends.
+        sphere_step_factor: share of the free distance that a ray goes at once, away from the surface.
+        min_slope: a ray that approaches the surface at less than this slope steps as if it had it.
+        min_section_weight: sections of a smaller weight are given no appearance of their own.
+        max_optical_depth: optical depth at which a ray ends.
     """
 
     sharpness: float
     step: float
     active_surface: int
     active_radiance: int
-    stride: float = 0.7
-    grazing: float = 0.5
-    significant: float = 1e-2
-    opaque: float = 3.0
+    sphere_step_factor: float = 0.7
+    min_slope: float = 0.5
+    min_section_weight: float = 1e-2
+    max_optical_depth: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -112,19 +112,19 @@ def composite(
     t, ray, offsets = samples
 
     def place(ray: Tensor, t: Tensor) -> Tensor:
-        return surface.grid.place(origins[ray] + directions[ray] * t[:, None])
+        return surface.grid.to_grid(origins[ray] + directions[ray] * t[:, None])
 
     sdf = surface(place(ray, t), sampling.active_surface)
     weights, crossing = kernels.section_weights(sdf, sampling.sharpness, offsets)
     with torch.no_grad():
         # what is left of a ray that was ended goes to its last section
         before = kernels.exclusive_sum(weights, offsets, ray)
-        enough = -torch.expm1(torch.tensor(-sampling.opaque))
+        enough = -torch.expm1(torch.tensor(-sampling.max_optical_depth))
         ends = (before + weights > enough) & ~(before > enough)
         rest = torch.where(ends, 1.0 - before - weights, torch.zeros_like(weights))
     weights = weights + rest
     opacity = weights.new_zeros(rays).index_add(0, ray, weights)
-    chosen = torch.nonzero(weights.detach() > sampling.significant)[:, 0]
+    chosen = torch.nonzero(weights.detach() > sampling.min_section_weight)[:, 0]
     following = (chosen + 1).clamp(max=max(len(t) - 1, 0))
     at, w = ray[chosen], weights[chosen]
     encoded = appearance(place(at, torch.lerp(t[chosen], t[following], crossing[chosen])), sampling.active_radiance)

@@ -28,7 +28,7 @@ class Surface(nn.Module):
         layer = nn.Linear(grid.width + 3, hidden)
         w = layer.weight.detach()
         self.hidden = nn.Parameter(torch.cat([w[:, -3:], layer.bias.detach()[:, None], w[:, :-3]], 1))
-        self.last = nn.Parameter(torch.zeros(hidden + 1))
+        self.output_weight = nn.Parameter(torch.zeros(hidden + 1))
         self.spheres = np.array(spheres, np.float32)
 
     def forward(self, positions: Tensor, active: int) -> Tensor:
@@ -40,7 +40,11 @@ class Surface(nn.Module):
         ones = torch.ones_like(positions[:, :1])
         hidden = torch.relu(torch.cat([positions, ones, self.grid(positions, active)], -1) @ self.hidden.T)
         norm = torch.linalg.vector_norm(positions, dim=-1)
-        return hidden @ self.last[:-1] + self.last[-1] + torch.minimum(norm - float(self.spheres[0]), float(self.spheres[1]) - norm)
+        return (
+            hidden @ self.output_weight[:-1]
+            + self.output_weight[-1]
+            + torch.minimum(norm - float(self.spheres[0]), float(self.spheres[1]) - norm)
+        )
 
     def gradient(self, positions: Tensor, epsilon: float, active: int) -> Tensor:
         """∇sdf by four-tap differences of size ``epsilon`` (Neuralangelo, Li et al. 2023): (N, 3) → (N, 3)."""

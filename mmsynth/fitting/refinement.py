@@ -39,7 +39,7 @@ def see(field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, beyond
     field.requires_grad_(False)  # rays alone: tables would gather gradients that the next step of the fit takes for its own
     with torch.enable_grad():
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
-        features, opacity = field.to_shade(hits) if beyond else (hits.features, hits.opacity)
+        features, opacity = field.with_far_light(hits) if beyond else (hits.features, hits.opacity)
         predicted = losses.predict(field.shader(features, directions, degrees), opacity, batch)
         relative = losses.residual(predicted if gain is None else predicted * gain, batch) / batch.level
         mean = torch.zeros_like(middle).index_add(0, batch.ray, relative) / torch.bincount(batch.ray, minlength=len(origins))

@@ -24,10 +24,10 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
         sharpness=sharpness,
         # at the default, two steps across the soft surface (its width is about 3.5 / s); never coarser than a tenth of the radius
         step=min(0.1, recipe.step_width / sharpness),
-        stride=recipe.stride,
-        grazing=recipe.grazing,
-        opaque=recipe.opaque,
-        significant=recipe.significant,
+        sphere_step_factor=recipe.stride,
+        min_slope=recipe.grazing,
+        max_optical_depth=recipe.opaque,
+        min_section_weight=recipe.significant,
         active_surface=active(design.surface_levels),
         active_radiance=active(design.radiance_levels),
     )

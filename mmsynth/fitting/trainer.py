@@ -86,9 +86,9 @@ class Trainer:
         self.measurements: dict[str, Measurements] = load_measurements(scene)
         self.needs: Needs = assess(scene, self.measurements, recipe, seed, self._rays_to_come())
         sensors = {n: m.sensor for n, m in self.measurements.items()}
-        levels = {n: m.level for n, m in self.measurements.items()}
+        radiance_scale = {n: m.level for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
-        self.field = Field(self.needs.design, sensors, levels, scene.region, scene.unit, cameras, rig_of(scene)).to(self.device)
+        self.field = Field(self.needs.design, sensors, radiance_scale, scene.region, scene.unit, cameras, rig_of(scene)).to(self.device)
         frames = sum(len(m.origins) for m in self.measurements.values())
         self.log_gain = torch.nn.Parameter(torch.zeros(frames, device=self.device))
         parameters = {**dict(self.field.named_parameters()), _GAINS: self.log_gain}
@@ -185,7 +185,7 @@ class Trainer:
         teaches = self._per_ray(batch, {n: n not in self.needs.scarce for n in batch.parts})
         gain = self._gain_of(batch)
         # light from beyond the region would explain what is in it as long as that has no shape
-        shaded = field.to_shade(hits) if self.state.decided else (hits.features, hits.opacity)
+        shaded = field.with_far_light(hits) if self.state.decided else (hits.features, hits.opacity)
         loss, squared = losses.compare(field.shader, *shaded, batch, degrees, teaches, gain)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_alpha:
@@ -266,7 +266,7 @@ class Trainer:
                 degree = recipe.view_dependence
                 evidence[f"view_dependence.{name}"] = f"degree {degree}: asked for by the recipe"
             degrees[name] = degree
-            level, frames = field.levels[name], len(self.measurements[name].origins)
+            level, frames = field.radiance_scale[name], len(self.measurements[name].origins)
             rows = [x[numbers][usable[numbers]].cpu().numpy() for x in (predicted / level, batch.target / level, batch.frame)]
             spread, noise = probe.exposure_spread(probe.Residuals(rows[0], rows[1], rows[2] - begin), frames)
             begin += frames
@@ -297,7 +297,7 @@ class Trainer:
             chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
             noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
             at = origins[chosen] + directions[chosen] * hits.depth[chosen, None]
-            points.append(self.field.surface.grid.place(at) + noise)
+            points.append(self.field.surface.grid.to_grid(at) + noise)
         epsilon = self.field.surface.grid.cell(sampling.active_surface)
         return self.field.surface.gradient(torch.cat(points), epsilon, sampling.active_surface)
 

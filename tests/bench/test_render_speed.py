@@ -37,7 +37,7 @@ def field() -> Field:
         torch.manual_seed(0)
         field = Field(design, dict(SENSORS), {"rgb": 0.5, "pol": 0.25}, Region((1.0, 2.0, 3.0), 2.0), cameras={"rgb": CAMERA})
         with torch.no_grad():
-            field.surface.last.normal_(0, 0.05)
+            field.surface.output_weight.normal_(0, 0.05)
             field.appearance.table.normal_()
     field.sampling = Sampling(20.0, 0.06, 2, 2)
     return field
@@ -68,7 +68,9 @@ def test_rows_are_there_for_one_modality_and_for_all(results: dict[str, Any]) ->
     assert {row["family"] for row in results["rows"]} == {family.__name__ for family in FAMILIES}
     for family in ("termination", "steps", "tiles", "threads"):
         assert {row["problem"] for row in _of(results, family, "")} == {"rgb", "all 2"}
-    assert [r["method"] for r in _of(results, "termination", "", "rgb")] == [f"opaque {v}" for v in ("1", "2", "3 (the field's)", "5", "8")]
+    assert [r["method"] for r in _of(results, "termination", "", "rgb")] == [
+        f"max_optical_depth {v}" for v in ("1", "2", "3 (the field's)", "5", "8")
+    ]
     asked = {row["method"]: row for row in _of(results, "asked", "")}
     assert set(asked) == {"rgb", "rgb, normals", "pol", "pol, normals", "all 2", "all 2, normals", "depth", "depth, normals"}
     assert "error" not in asked["depth"] and asked["depth, normals"]["normal"] < 5.0
@@ -83,7 +85,7 @@ def test_error_falls_with_finer_sampling(results: dict[str, Any], problem: str) 
         assert values == sorted(values) and values[0] < 0.3 * values[-1], key
     samples = [row["samples"] for row in steps]
     assert samples == sorted(samples, reverse=True) and results["reference"]["samples"] > 2 * samples[0]
-    ends = _of(results, "termination", "opaque", problem)
+    ends = _of(results, "termination", "max_optical_depth", problem)
     assert [row["samples"] for row in ends] == sorted(row["samples"] for row in ends)
     assert ends[0]["error"] > 2 * ends[2]["error"]
     assert 0 < results["reference"]["doubt"] < 0.5 * steps[0]["error"]

@@ -241,7 +241,7 @@ def test_section_weights_without_samples(device: str) -> None:
 def test_surface_value_equals_the_network(device: str, hidden: int, active: int, extent: float) -> None:
     surface = Surface(HashGrid(6, 8, 3, 300, extent), hidden, (0.5, 1.5)).to(device)
     torch.nn.init.normal_(surface.grid.table)
-    torch.nn.init.normal_(surface.last)
+    torch.nn.init.normal_(surface.output_weight)
     positions = (2.2 * torch.rand(200, 3, device=device) - 1.1) * extent  # some are outside
     found = cuda.surface_value(surface, positions, active)
     expected = surface.double().reference(positions.double(), active)
@@ -291,7 +291,7 @@ def _rays(count: int, extent: float, device: str) -> list[torch.Tensor]:
 )  # fmt: skip
 def test_march_equals_reference(device: str, field: str, states: str, step: float, extent: float) -> None:
     rays, grid = _rays(50, extent, device), _states(states, extent).to(device)
-    sampling = Sampling(sharpness=60.0, step=step, active_surface=1, active_radiance=1, opaque=2.0)
+    sampling = Sampling(sharpness=60.0, step=step, active_surface=1, active_radiance=1, max_optical_depth=2.0)
     t, ray, offsets = cuda.march(FIELDS[field], *rays, grid, extent, sampling)
     t64, ray64, offsets64 = reference.march(FIELDS[field], *(x.double() for x in rays), grid, extent, sampling)
     assert (t.dtype, ray.dtype, offsets.dtype) == (torch.float32, torch.int64, torch.int64)
@@ -330,7 +330,7 @@ def test_a_trace_on_these_kernels(device: str, extent: float, monkeypatch: pytes
         monkeypatch.setattr(kernels, "on_cpu", lambda tensor: False)
     surface, appearance = Surface(HashGrid(3, 8, 3, 12, extent), 8, (0.5, 1.7 * extent)), HashGrid(2, 8, 3, 9, extent)
     torch.nn.init.normal_(surface.grid.table, std=0.1)
-    torch.nn.init.normal_(surface.last, std=0.1)
+    torch.nn.init.normal_(surface.output_weight, std=0.1)
     torch.nn.init.normal_(appearance.table)
     occupancy = Occupancy(16, extent)
     occupancy.states.copy_(torch.where(torch.rand(16, 16, 16) < 0.3, OUTSIDE, SHELL))

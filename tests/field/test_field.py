@@ -30,11 +30,11 @@ def _field(background: bool, region: Region | None = None) -> Field:
     torch.manual_seed(0)
     design = Design(
         surface_levels=2, radiance_levels=2, surface_rows_log2=12, radiance_rows_log2=10, surface_finest=128, radiance_finest=12,
-        background=background, horizon=1.9, surface_hidden=8, radiance_hidden=8, coarsest=5, occupancy=16,
+        background=background, outer_radius=1.9, surface_hidden=8, radiance_hidden=8, coarsest=5, occupancy=16,
     )  # fmt: skip
     field = Field(design, dict(SENSORS), LEVELS, region or Region((0.0, 0.0, 0.0), 1.0))
     with torch.no_grad():
-        field.surface.last.normal_(0, 0.05)
+        field.surface.output_weight.normal_(0, 0.05)
         field.appearance.table.normal_()
     field.sampling = replace(field.sampling, sharpness=400.0, step=0.005)
     return field
@@ -162,7 +162,12 @@ def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> No
     field.sensors["nir"] = replace(NIR, saturation=float("inf"), mosaic=np.array([[0]]))
     field.save(tmp_path)
     again = Field.load(tmp_path)
-    assert (again.design, again.region, again.sampling, again.levels) == (field.design, field.region, field.sampling, field.levels)
+    assert (again.design, again.region, again.sampling, again.radiance_scale) == (
+        field.design,
+        field.region,
+        field.sampling,
+        field.radiance_scale,
+    )
     assert again.view_dependence == field.view_dependence and again.sensors["nir"].saturation == float("inf")
     assert int(again.occupancy.states[3, 4, 5]) == 17 and again.surface.grid.extent == field.surface.grid.extent
     a, b = _look_around(field, 50)[2], _look_around(again, 50)[2]

@@ -50,7 +50,7 @@ def _surface(grid: str, extent: float, hidden: int = 12) -> Surface:
     surface = Surface(HashGrid(*GRIDS[grid], extent), hidden, (0.5, 1.9 if extent > 1 else 1e9))
     with torch.no_grad():
         surface.grid.table.normal_(0, 0.3)
-        surface.last.normal_(0, 0.3)
+        surface.output_weight.normal_(0, 0.3)
     return surface
 
 
@@ -80,7 +80,7 @@ def test_surface_value(grid: str, extent: float, active: int, count: int) -> Non
     gradient = torch.randn(count, generator=torch.Generator().manual_seed(1))
     found.backward(gradient)
     expected.backward(gradient.double())
-    parts = {"positions": (a, b), "hidden": (surface.hidden, exact.hidden), "last": (surface.last, exact.last)}
+    parts = {"positions": (a, b), "hidden": (surface.hidden, exact.hidden), "last": (surface.output_weight, exact.output_weight)}
     parts["table"] = surface.grid.table, exact.grid.table
     if not count:
         assert all(not p.grad.any() for p, _ in parts.values() if p.grad is not None) and surface.hidden.grad is not None
@@ -168,8 +168,8 @@ def test_hidden_units_come_in_fours() -> None:
 SAMPLINGS = {
     "soft": Sampling(40.0, 0.05, 3, 2),
     "sharp": Sampling(400.0, 0.005, 3, 2),
-    "coarse": Sampling(10.0, 0.1, 2, 1, opaque=8.0, significant=0.05),  # not all levels
-    "slow": Sampling(20.0, 0.01, 3, 2, stride=0.1, grazing=1.0),  # rays of the most samples
+    "coarse": Sampling(10.0, 0.1, 2, 1, max_optical_depth=8.0, min_section_weight=0.05),  # not all levels
+    "slow": Sampling(20.0, 0.01, 3, 2, sphere_step_factor=0.1, min_slope=1.0),  # rays of the most samples
 }
 # what float32 leaves: most is lost in gradients that are sums of large numbers of both signs
 TOLERANCES = {
@@ -185,7 +185,7 @@ def _parts(extent: float, states: str, seed: int, levels: int = 3) -> tuple[Surf
     appearance, occupancy = HashGrid(max(levels - 1, 1), 12, 8, 60, extent), Occupancy(32, extent)
     with torch.no_grad():
         surface.grid.table.normal_(0, 0.3)
-        surface.last.normal_(0, 0.05)
+        surface.output_weight.normal_(0, 0.05)
         appearance.table.normal_()
     if states == "own":
         occupancy.update(lambda x: surface(x, 3), 40.0, torch.Generator().manual_seed(seed), 1.0)
@@ -228,7 +228,7 @@ def _quantities(
     return {
         "features": hits.features, "opacity": hits.opacity, "depth": hits.depth / (1 + hits.depth),
         "gradient of the surface's table": surface.grid.table.grad, "gradient of the appearance": appearance.table.grad,
-        "gradient of hidden": surface.hidden.grad, "gradient of last": surface.last.grad,
+        "gradient of hidden": surface.hidden.grad, "gradient of last": surface.output_weight.grad,
         "gradient of origins": origins.grad, "gradient of directions": directions.grad,
     }, hits  # fmt: skip
 
@@ -334,12 +334,12 @@ def test_passes_do_not_share_what_they_keep() -> None:
     for batch in batches:
         parts[0].zero_grad()
         rendering.trace(*parts, *batch, sampling).opacity.square().sum().backward()
-        alone.append([p.grad.clone() for p in (parts[0].hidden, parts[0].last, parts[0].grid.table)])
+        alone.append([p.grad.clone() for p in (parts[0].hidden, parts[0].output_weight, parts[0].grid.table)])
     losses = [rendering.trace(*parts, *batch, sampling).opacity.square().sum() for batch in batches]
     for k in (1, 2, 0):
         parts[0].zero_grad()
         losses[k].backward()
-        for p, expected in zip((parts[0].hidden, parts[0].last, parts[0].grid.table), alone[k], strict=True):
+        for p, expected in zip((parts[0].hidden, parts[0].output_weight, parts[0].grid.table), alone[k], strict=True):
             assert torch.equal(p.grad, expected)
 
 

@@ -96,7 +96,7 @@ def test_surface_gradients(extent: float, active: int) -> None:
     torch.manual_seed(1)
     surface = Surface(HashGrid(3, 6, 2, 11, extent), 4, (0.5, 1.9 if extent > 1 else 1e9)).double()
     positions = ((torch.rand(5, 3, dtype=torch.float64) * 2 - 1) * extent).requires_grad_()
-    hidden, last = (torch.randn_like(p).requires_grad_() for p in (surface.hidden, surface.last))
+    hidden, last = (torch.randn_like(p).requires_grad_() for p in (surface.hidden, surface.output_weight))
     table = torch.randn_like(surface.grid.table).requires_grad_()
 
     def value(positions: torch.Tensor, *parameters: torch.Tensor) -> torch.Tensor:
@@ -117,7 +117,7 @@ def test_gradient_by_four_taps_is_exact_for_linear_functions_and_true_for_a_sphe
     surface = Surface(HashGrid(1, 8, 3, 3), 4, (0.5, 1e9)).double()
     with torch.no_grad():
         surface.hidden[0] = torch.tensor([0.3, -2.0, 1.0, 5.0, 0, 0, 0, 0])
-        surface.last[0] = 1.0
+        surface.output_weight[0] = 1.0
     x = normalize(torch.randn(20, 3, dtype=torch.float64), dim=1) * 0.7
     expected = torch.tensor([0.3, -2.0, 1.0]) + x / 0.7
     for epsilon in (1e-3, 1e-6):  # the error is the curvature, 1 / 0.7, times the size of the taps
@@ -212,7 +212,7 @@ def test_falling_sdf_has_the_closed_form_opacity(sharpness: float, end: float, c
 # --- marching
 
 SHARPNESS, STEP, OPAQUE = 200.0, 0.01, 3.0
-SAMPLING = Sampling(SHARPNESS, STEP, 1, 1, opaque=OPAQUE)
+SAMPLING = Sampling(SHARPNESS, STEP, 1, 1, max_optical_depth=OPAQUE)
 Distance = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -328,7 +328,7 @@ def test_a_ray_ends_at_its_second_sample_in_a_solid_cell() -> None:
     assert len(t) == 2
     states[:4] = SHELL  # the first solid cell begins at x = 0
     t, _, _ = reference.march(lambda x: torch.full_like(x[:, 0], 0.0), *ray, *rest, states, 1.0, SAMPLING)
-    assert 0.9 <= t[-1] <= 0.9 + STEP / SAMPLING.grazing and (t[:-1] < 0.9).all()
+    assert 0.9 <= t[-1] <= 0.9 + STEP / SAMPLING.min_slope and (t[:-1] < 0.9).all()
 
 
 def test_no_ray_takes_more_than_the_most_samples() -> None:

@@ -79,7 +79,7 @@ def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> 
     assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.evidence
     assert trainer.gains() == {}, trainer.needs.evidence
     assert trainer.needs.scarce == ()
-    assert trainer.field.beyond is None and trainer.needs.evidence["beyond"].startswith("off")
+    assert trainer.field.far_light is None and trainer.needs.evidence["beyond"].startswith("off")
     assert trainer.field.shader.heads.out_features == 3  # no tensor head
     assert trainer.needs.evidence["tensor_head"].startswith("off")
     assert trainer.report().psnr["rgb"] > 25  # the decisions are about a fit that works
@@ -106,8 +106,8 @@ def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
 def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) -> None:
     scene = _scene(tmp_path / "s", room=0.2)
     trainer, without = _fitted(scene), _fitted(scene, beyond="off")
-    assert trainer.needs.design.beyond and not trainer.needs.design.background, trainer.needs.evidence
-    assert without.field.beyond is None and "asked for by the recipe" in without.needs.evidence["beyond"]
+    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.needs.evidence
+    assert without.field.far_light is None and "asked for by the recipe" in without.needs.evidence["beyond"]
     assert _past_the_ball(trainer, scene) < 0.5 * _past_the_ball(without, scene)
     # and it is still known after it was stored
     trainer.field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)

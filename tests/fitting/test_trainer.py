@@ -309,14 +309,14 @@ def test_a_loss_that_is_not_finite_skips_the_step(scene: Scene) -> None:
     assert all(torch.isfinite(p).all() for p in trainer.field.parameters()) and math.isfinite(trainer.mean_loss)
 
 
-@pytest.mark.parametrize("what", ["surface.last", "shader.heads.weight", "surface.grid.table"])
+@pytest.mark.parametrize("what", ["surface.output_weight", "shader.heads.weight", "surface.grid.table"])
 def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str) -> None:
     trainer = _trainer(scene)
     trainer.run_step()
     parameter = dict(trainer.field.named_parameters())[what]
     if what == "surface.grid.table":  # its gradient is added in place: what is NaN there came by the network
         trainer.field.surface.hidden.register_hook(lambda g: g * torch.nan)
-        hook = trainer.field.surface.last.register_hook(lambda g: g * torch.nan)
+        hook = trainer.field.surface.output_weight.register_hook(lambda g: g * torch.nan)
     else:
         hook = parameter.register_hook(lambda g: g * torch.nan)
     before, moments = _tensors(trainer.field), {n: [x.clone() for x in m] for n, m in trainer.optimiser.moments.items()}
@@ -351,7 +351,7 @@ def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, mo
 def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -> None:
     trainer = _trainer(scene, 100)
     with torch.no_grad():
-        trainer.field.surface.last[-1] = torch.nan
+        trainer.field.surface.output_weight[-1] = torch.nan
     with pytest.raises(InputError, match="not finite in 20 steps"):
         for _ in range(100):
             trainer.run_step()
@@ -387,7 +387,7 @@ def test_black_pixels_of_a_black_scene_ask_for_emptiness(tmp_path: Path) -> None
     assert trainer.needs.black_background and not trainer.needs.design.background
     batch = _batch(trainer, 400)
     with torch.no_grad():  # all opaque, so that there is something to lose
-        trainer.field.surface.last[-1] = -0.6
+        trainer.field.surface.output_weight[-1] = -0.6
     opacity = _opacity(trainer, batch)
     black = batch.target.reshape(400, 3).amax(1) == 0
     assert 50 < black.sum() < 350 and (opacity[black] > 0.5).sum() > 50
@@ -485,7 +485,7 @@ def test_a_grid_in_which_nothing_is_left_opens_again_and_it_is_counted(scene: Sc
     trainer.run_step()
     assert trainer.state.reopened == 0
     with torch.no_grad():
-        trainer.field.surface.last[-1] = 5.0
+        trainer.field.surface.output_weight[-1] = 5.0
     trainer.run_step()
     assert trainer.state.reopened == 1 and (trainer.field.occupancy.states == SHELL).all()
 

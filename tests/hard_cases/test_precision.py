@@ -55,7 +55,7 @@ def test_half_precision_overflows_where_ours_does_not(row: Row) -> None:
     surface = _sphere(64)
     with torch.no_grad():
         surface.hidden.mul_(1e5)
-        surface.last.normal_(0, 1e-6)
+        surface.output_weight.normal_(0, 1e-6)
     points = torch.rand(500, 3) * 2 - 1
     half = copy.deepcopy(surface).half()
     usual = torch.relu(torch.cat([points, torch.ones(500, 1), surface.grid(points, 2)], 1).half() @ half.hidden.T)

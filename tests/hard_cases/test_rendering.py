@@ -122,7 +122,7 @@ def test_a_camera_deep_inside_sees_what_the_formula_says(way: str, s: float) -> 
     """From f = -0.05 to the centre at -0.5: log Φ falls by almost s · 0.45, whatever the surface did before."""
     step = 0.02
     origins, directions = torch.tensor([[0.0, 0.0, -0.45]]), torch.tensor([[0.0, 0.0, 1.0]])
-    hits = _trace(way, _parts(), origins, directions, Sampling(s, step, 2, 2, opaque=100.0), jitter=0.0)
+    hits = _trace(way, _parts(), origins, directions, Sampling(s, step, 2, 2, max_optical_depth=100.0), jitter=0.0)
     tau = softplus(torch.tensor(s * 0.5)) - softplus(torch.tensor(s * 0.05))
     # the sample next to the centre is half a step from it at most
     assert 1 - np.exp(-float(tau) + s * step / 2) - 1e-3 <= float(hits.opacity.detach()) <= 1 - np.exp(-float(tau)) + 1e-3
@@ -152,7 +152,7 @@ def test_any_sharpness_is_finite_and_sums_to_at_most_one(row: Row, s: float) -> 
 def test_any_sharpness_gives_finite_rays_and_gradients(way: str, classified: bool, s: float) -> None:
     parts, sampling = _parts(), Sampling(s, min(0.1, 2 / s), 2, 2)
     with torch.no_grad():
-        parts[0].last.normal_(0, 0.02)
+        parts[0].output_weight.normal_(0, 0.02)
     if classified:
         parts[2].update(lambda x: parts[0](x, 2), s, torch.Generator().manual_seed(0), 1.0)
     parts[0].requires_grad_(way != "float64")  # there a copy is asked
@@ -194,7 +194,7 @@ def test_a_ray_that_was_ended_is_opaque(way: str) -> None:
         parts[1].table.fill_(0.7)
     rays = _towards(200, 0.2)
     ended = _trace(way, parts, *rays)
-    whole = _trace(way, parts, *rays, Sampling(400.0, 0.005, 2, 2, opaque=30.0))
+    whole = _trace(way, parts, *rays, Sampling(400.0, 0.005, 2, 2, max_optical_depth=30.0))
     assert ended.samples < whole.samples
     torch.testing.assert_close(ended.opacity, torch.ones_like(ended.opacity), atol=1e-6, rtol=0)
     torch.testing.assert_close(ended.features, torch.full_like(ended.features, 0.7), atol=1e-6, rtol=0)
@@ -489,11 +489,11 @@ def test_not_a_number_is_not_swallowed(way: str) -> None:
     """A fit must see it, to skip the step."""
     parts = _parts()
     with torch.no_grad():
-        parts[0].last[-1] = torch.nan
+        parts[0].output_weight[-1] = torch.nan
     assert _trace(way, parts, *_towards(50, 0.3)).opacity.isnan().all()
     parts = _parts()
     (_trace(way, parts, *_towards(50, 0.3)).opacity * torch.where(torch.arange(50) == 7, torch.nan, 1.0)).sum().backward()
-    assert parts[0].last.grad.isnan().all()
+    assert parts[0].output_weight.grad.isnan().all()
     parts = _parts()
     with torch.no_grad():
         parts[1].table.fill_(torch.nan)
@@ -601,7 +601,7 @@ def test_places_on_the_border_of_the_cube_are_in_the_last_cell() -> None:
     grid = HashGrid(2, 10, 3, 9)
     surface = Surface(grid, 4, (0.5, 1e9))
     with torch.no_grad():
-        surface.last.normal_()
+        surface.output_weight.normal_()
         grid.table.normal_()
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     inside = corners * (1 - 1e-5)

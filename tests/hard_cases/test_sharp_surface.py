@@ -19,7 +19,7 @@ def _moved(sharpness: float, slower: bool = True) -> float:
     torch.manual_seed(0)
     recipe = Recipe()
     surface = Surface(HashGrid(4, 12, 8, 64), 16, (0.5, 4.0))
-    torch.nn.init.normal_(surface.last, std=0.3)
+    torch.nn.init.normal_(surface.output_weight, std=0.3)
     parameters = dict(surface.named_parameters())
     optimiser = Adam(parameters, {n: recipe.learning_rate_grid if n == "grid.table" else recipe.learning_rate_network for n in parameters})
     factors = dict.fromkeys(parameters, surface_rate_factor(sharpness, recipe) if slower else 1.0)

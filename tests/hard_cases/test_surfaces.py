@@ -104,7 +104,7 @@ def test_blocks_and_the_border_leave_no_holes(row: Row) -> None:
 def test_no_surface_is_said(row: Row, level: float) -> None:
     field = _ball(0.5)
     with torch.no_grad():
-        field.surface.last[-1] = level
+        field.surface.output_weight[-1] = level
     with pytest.raises(InputError, match="no surface in the region"):
         extract_mesh(field, 16, 8)
     with pytest.raises(ValueError, match="within volume data range"):

@@ -89,7 +89,7 @@ def _hidden_eikonal(trainer: Trainer, steps: int) -> tuple[float, float]:
         loss.backward()
         optimiser.step()
         worst = max(worst, float(loss.detach()))
-    return worst, float(torch.cat([p.detach().flatten() for p in (surface.hidden, surface.last)]).isnan().float().mean())
+    return worst, float(torch.cat([p.detach().flatten() for p in (surface.hidden, surface.output_weight)]).isnan().float().mean())
 
 
 @pytest.mark.parametrize("table", ["appearance.table", "surface.grid.table"])

@@ -150,12 +150,12 @@ def march(
             depth[here] += tau.clamp(min=0.0).to(f)
             slope = (last[1][here] - f) / ((at - last[0][here]) * speed)
         last[0][here], last[1][here] = at, f
-        jump = s.step / slope.clamp(min=s.grazing)
-        jump = torch.where(f > 0, torch.maximum(jump, s.stride * (f - 3.0 / s.sharpness)), jump) / speed
+        jump = s.step / slope.clamp(min=s.min_slope)
+        jump = torch.where(f > 0, torch.maximum(jump, s.sphere_step_factor * (f - 3.0 / s.sharpness)), jump) / speed
         if extent > 1:
             jump = torch.minimum(jump, _SKIP * reach)
         t[here] = at + jump
-        going = here[(depth[here] <= s.opaque) & ~((state == SOLID) & (k > 0))]
+        going = here[(depth[here] <= s.max_optical_depth) & ~((state == SOLID) & (k > 0))]
         if not len(going):
             break
     if not found:

@@ -92,7 +92,7 @@ def test_no_part_of_a_learned_field_is_lost(seed: int) -> None:
         torch.manual_seed(seed)
         field = Field(design, {"mono": MONO}, {"mono": 0.5}, UNIT)
         field.surface.grid.table.uniform_(-0.6, 0.6)
-        field.surface.last[:-1].uniform_(-0.6, 0.6)
+        field.surface.output_weight[:-1].uniform_(-0.6, 0.6)
     field.sampling = Sampling(20.0, 0.05, 3, 1)
     v, _ = march(field.sdf, UNIT, n, 16)
     whole, _ = dense(lambda p: field.sdf(p.reshape(-1, 3)).reshape(p.shape[:-1]), n)

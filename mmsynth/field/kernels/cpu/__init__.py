@@ -150,7 +150,7 @@ class _Trace(torch.autograd.Function):
         names = "block hidden sdf ray_of time_of t_of f_of p_of id_of counts rounds sizes s_block s_ray s_k s_time s_weight s_count"
         cpu_rays.trace_forward(
             *(_array(x) for x in (origins, directions, near, far, jitter, states)), f(surface.grid.extent), surface.grid.extent > 1.0,
-            float(s.sharpness), f(s.step), f(s.stride), f(s.grazing), f(s.significant), float(s.opaque),
+            float(s.sharpness), f(s.step), f(s.sphere_step_factor), f(s.min_slope), f(s.min_section_weight), float(s.max_optical_depth),
             surface.spheres, *_grid(surface.grid), s.active_surface, _array(weight), _array(last), *_grid(appearance), s.active_radiance,
             keep, *store.take(names), features.numpy(), opacity.numpy(), shown.numpy(), depth.numpy(), samples.numpy(),
         )  # fmt: skip
@@ -235,7 +235,7 @@ def _kept(*tensors: Tensor) -> bool:
 def surface_value(surface: Surface, positions: Tensor, active: int) -> Tensor:
     """See ``Surface.forward``; float32. Differentiable in positions, weights, and, in place, the table."""
     active = min(active, len(surface.grid.resolutions))
-    return _Value.apply(_kept(positions, surface.hidden), positions, surface, active, surface.hidden, surface.last)
+    return _Value.apply(_kept(positions, surface.hidden), positions, surface, active, surface.hidden, surface.output_weight)
 
 
 def trace(
@@ -246,7 +246,9 @@ def trace(
     active = min(sampling.active_surface, len(surface.grid.resolutions)), min(sampling.active_radiance, len(appearance.resolutions))
     sampling = replace(sampling, active_surface=active[0], active_radiance=active[1])
     keep = _kept(origins, directions, surface.hidden)
-    return _Trace.apply(keep, origins, directions, near, far, jitter, states, sampling, surface, appearance, surface.hidden, surface.last)
+    return _Trace.apply(
+        keep, origins, directions, near, far, jitter, states, sampling, surface, appearance, surface.hidden, surface.output_weight
+    )
 
 
 def compare(

@@ -552,7 +552,7 @@ def surface_value(surface: Surface, positions: Tensor, active: int) -> Tensor:
         with torch.cuda.device_of(out):
             _surface[(triton.cdiv(count, _BLOCK),)](
                 positions.contiguous(), 0.5 / grid.extent, *(float(r) for r in surface.spheres), grid.table.contiguous(),
-                grid.resolutions, grid.offsets, surface.hidden.T.contiguous(), surface.last, out, count, min(active, levels),
+                grid.resolutions, grid.offsets, surface.hidden.T.contiguous(), surface.output_weight, out, count, min(active, levels),
                 units, grid.table.shape[1], _BLOCK, width, num_warps=warps,
             )  # fmt: skip
     return out
@@ -584,8 +584,8 @@ def march(
         with torch.cuda.device_of(found):
             _round[(triton.cdiv(count, _LANES),)](
                 lanes, value, origins, directions, far, jitter, states, memory, found, counts, where, alive, count, rays, k, grid,
-                0.5 * grid / extent, extent, s.step, _SKIP if extent > 1 else math.inf, s.stride,
-                3.0 / s.sharpness, s.grazing, s.opaque, float(s.sharpness), MOST, _ONWARD, extent > 1, _LANES, num_warps=1,
+                0.5 * grid / extent, extent, s.step, _SKIP if extent > 1 else math.inf, s.sphere_step_factor,
+                3.0 / s.sharpness, s.min_slope, s.max_optical_depth, float(s.sharpness), MOST, _ONWARD, extent > 1, _LANES, num_warps=1,
             )  # fmt: skip
         if k + 1 == MOST:
             break
