@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 from mmsynth.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from mmsynth.errors import InputError
+    from mmsynth.errors import DivergedError, InputError
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
-    from mmsynth.fitting.trainer import fit
+    from mmsynth.fitting.run import fit
     from mmsynth.operations.conversion.methods import convert
     from mmsynth.operations.dataset.aligned import AlignedDataset
     from mmsynth.operations.dataset.generate import generate_dataset
     from mmsynth.operations.evaluation.evaluate import evaluate
-    from mmsynth.operations.mesh.extract import extract_mesh, write_mesh
+    from mmsynth.operations.mesh.extract import extract_mesh
+    from mmsynth.operations.mesh.files import write_mesh
     from mmsynth.operations.simulation.calibrate_noise import calibrate_noise
     from mmsynth.operations.simulation.simulate import simulate
     from mmsynth.scene.load import load_scene
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "AlignedDataset": "operations.dataset.aligned",
+    "DivergedError": "errors",
     "InputError": "errors",
     "Field": "field.field",
     "Rendering": "field.field",
@@ -34,17 +36,18 @@ _HOMES = {
     "calibrate_noise": "operations.simulation.calibrate_noise",
     "Recipe": "fitting.recipe",
     "load_recipe": "fitting.recipe",
-    "fit": "fitting.trainer",
+    "fit": "fitting.run",
     "convert": "operations.conversion.methods",
     "generate_dataset": "operations.dataset.generate",
     "evaluate": "operations.evaluation.evaluate",
     "extract_mesh": "operations.mesh.extract",
-    "write_mesh": "operations.mesh.extract",
+    "write_mesh": "operations.mesh.files",
     "load_scene": "scene.load",
     "simulate": "operations.simulation.simulate",
 }
 __all__ = [
     "AlignedDataset",
+    "DivergedError",
     "Field",
     "InputError",
     "Recipe",

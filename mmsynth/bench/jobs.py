@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mmsynth.bench.machine import identify
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
 from mmsynth.files import read_json, write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.operations.output.progress import Progress
@@ -64,7 +64,7 @@ def scene_of(task: Mapping[str, Any]) -> Scene:
     Raises:
         InputError: no such scene, modality or number of frames.
     """
-    return keep_frames(load_scene(Path(task["scene"]), task["modalities"]), task["frames"])
+    return keep_frames(load_scene(Path(task["scene"]), modalities=task["modalities"]), task["frames"])
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -> Iterator[dict[str, Any]]:
@@ -113,6 +113,7 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
 
     Raises:
         InputError: the task was refused or its process died.
+        DivergedError: its fit diverged.
     """
     with tempfile.TemporaryDirectory(prefix="mmsynth-bench-") as folder, open(Path(folder) / "stderr", "w+b") as said:
         command = [sys.executable, "-m", module, json.dumps(task), folder]
@@ -125,8 +126,9 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
             return read_json(Path(folder) / "result.json")
         said.seek(0)
         lines = said.read().decode(errors="replace").strip().splitlines() or ["it said nothing"]
-        if status == 2 and lines[-1].startswith("error: "):
-            raise InputError(lines[-1].removeprefix("error: "))
+        for error in (InputError, DivergedError):
+            if status == error.exit_code and lines[-1].startswith("error: "):
+                raise error(lines[-1].removeprefix("error: "))
         raise InputError(f"{name}: its process ended with status {status} instead of a score ({lines[-1]}).")
 
 

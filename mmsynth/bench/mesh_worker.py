@@ -17,9 +17,9 @@ from mmsynth.bench.machine import peak_memory
 from mmsynth.bench.worker import serve
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
-from mmsynth.operations.mesh.attributes import views_of
-from mmsynth.operations.mesh.extract import extract_mesh
-from mmsynth.operations.mesh.report import compare, describe, load_reference
+from mmsynth.operations.mesh.attributes import training_views
+from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
+from mmsynth.operations.mesh.quality import compare_meshes, describe_mesh, load_reference
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 
@@ -48,9 +48,9 @@ def every_block(field: Field, scene: Scene, n: int) -> trimesh.Trimesh:
 
 METHODS: dict[str, Callable[[Field, Scene, int], trimesh.Trimesh]] = {
     "every block": every_block,
-    "mmsynth": lambda field, scene, n: extract_mesh(field, n),
-    "mmsynth, closed": lambda field, scene, n: extract_mesh(field, n, closed=True),
-    "mmsynth, all modalities": lambda field, scene, n: extract_mesh(field, n, scene=scene),
+    "mmsynth": lambda field, scene, n: extract_mesh(field, MeshOptions(n)),
+    "mmsynth, closed": lambda field, scene, n: extract_mesh(field, MeshOptions(n, closed=True)),
+    "mmsynth, all modalities": lambda field, scene, n: extract_mesh(field, MeshOptions(n), scene=scene),
 }
 
 
@@ -58,13 +58,13 @@ def work(task: Mapping[str, Any], _: Path) -> dict[str, Any]:
     """Mesh a field and score the mesh.
 
     Returns:
-        ``seconds``, ``cpu_share`` and ``peak_memory_bytes`` (all of the process) of the extraction, ``mesh`` (see ``describe``),
-        ``against`` (see ``compare``) where the task has a reference.
+        ``seconds``, ``cpu_share`` and ``peak_memory_bytes`` (all of the process) of the extraction, ``mesh`` (see ``describe_mesh``),
+        ``against`` (see ``compare_meshes``) where the task has a reference.
     Raises:
         InputError: no such run, scene or reference, or nothing to mesh.
     """
     field = Field.load(Path(task["run"]))
-    scene = load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))
+    scene = load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors))
     reference = None if task["against"] is None else load_reference(Path(task["against"]))
     began, cpu = time.perf_counter(), time.process_time()
     mesh = METHODS[task["method"]](field, scene, task["resolution"])
@@ -72,9 +72,10 @@ def work(task: Mapping[str, Any], _: Path) -> dict[str, Any]:
     out: dict[str, Any] = {"seconds": seconds, "cpu_share": cpu / (seconds * torch.get_num_threads()), "peak_memory_bytes": peak_memory()}
     mesh.metadata["unit"] = field.unit
     sdf = None if task["method"] == "mmsynth, closed" else field.sdf  # the border's cap is no zero of the field
-    out["mesh"] = describe(mesh, sdf, 2.0 * field.region.radius / task["resolution"])
+    out["mesh"] = describe_mesh(mesh, sdf, 2.0 * field.region.radius / task["resolution"])
     if reference is not None:
-        out["against"] = compare(mesh, reference, field.region, views_of(field, scene), task["distances"])
+        views = training_views(field, scene)
+        out["against"] = compare_meshes(mesh, reference, region=field.region, views=views, distances=task["distances"])
     return out
 
 

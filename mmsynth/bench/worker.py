@@ -19,11 +19,11 @@ import torch
 
 from mmsynth.bench.jobs import scene_of
 from mmsynth.bench.machine import peak_memory
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.kernels import announce_compilation
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.trainer import fit
+from mmsynth.fitting.run import fit
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.scene.load import load_scene
 
@@ -44,7 +44,8 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         announce_compilation()
     began, cpu = time.perf_counter(), time.process_time()
     scene = scene_of(task)
-    field = fit(scene, folder / "run", Recipe(**task["recipe"]), task["steps"], task["budget"], task["seed"], device)
+    length = {"steps": task["steps"], "budget": task["budget"]}
+    field = fit(scene, folder / "run", recipe=Recipe(**task["recipe"]), **length, seed=task["seed"], device=device)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at
@@ -61,8 +62,8 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def serve(work: Callable[[Mapping[str, Any], Path], dict[str, Any]]) -> None:
-    """Read the arguments, work on the task (in a folder that is thrown away), write the result; an ``InputError`` becomes one sentence and
-    exit code 2."""
+    """Read the arguments, work on the task (in a folder that is thrown away), write the result; an error becomes one sentence and
+    its exit code."""
 
     def end_with_the_parent() -> None:
         while os.read(0, 1):
@@ -73,9 +74,9 @@ def serve(work: Callable[[Mapping[str, Any], Path], dict[str, Any]]) -> None:
     task, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
     try:
         write_json(folder / "result.json", work(task, folder))
-    except InputError as error:
+    except (InputError, DivergedError) as error:
         print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        raise SystemExit(error.exit_code) from None
 
 
 if __name__ == "__main__":

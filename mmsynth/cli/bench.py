@@ -44,8 +44,8 @@ def bench_fit(
 ) -> None:
     """Error over time: a fit from scratch per time budget, each in a process of its own."""
     from mmsynth.bench.fit import bench_fit as measure
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.fitting.trainer import pick_device
 
     times = [seconds_of(text, "--budgets") for text in budgets.split(",")]
     with progress_bar("bench fit", as_json) as show:
@@ -92,7 +92,7 @@ def bench_ablation(
 ) -> None:
     """What each choice is worth: variants of a fit against a baseline, in seconds and dB."""
     from mmsynth.bench.ablation import bench_ablation as measure
-    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.fitting.device import pick_device
 
     seconds = fit_length(steps, budget, "60s")
     chosen = None if only is None else [name.strip() for name in only.split(",")]

@@ -51,22 +51,22 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
-    from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.fitting.trainer import Progress, pick_device
+    from mmsynth.fitting.trainer import FitProgress
     from mmsynth.report.text import fit_text
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
     from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    loaded = keep_frames(load_scene(scene_path(scene), modality_names(modalities)), frame_limits(frames))
+    loaded = keep_frames(load_scene(scene_path(scene), modalities=modality_names(modalities)), frame_limits(frames))
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")
     with progress_bar("fit", as_json) as show:
 
-        def on_step(news: Progress) -> None:
+        def on_step(news: FitProgress) -> None:
             psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
             show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
 
@@ -82,7 +82,7 @@ def fit(
             explain(needs.evidence)
 
         fitted = fit_run(
-            loaded, run, recipe=load_recipe(recipe), steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
+            loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
             on_start=on_start, on_step=on_step,
         )  # fmt: skip
         explain(fitted.field.manifest["needs"]["evidence"])  # with what residuals decided on the way
@@ -130,8 +130,8 @@ def batch(
     as_json: JsonOption = False,
 ) -> None:
     """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.fitting.trainer import pick_device
     from mmsynth.operations.output.work_partition import share_of_environment
     from mmsynth.workflows.batch import Job, read_scene_list, run_batch
 

@@ -91,7 +91,7 @@ def generate_dataset(
 ) -> None:
     """An aligned dataset: every modality, depth, normals, opacity, coverage, flow, intrinsics and pose per view. Under torchrun every
     process makes its share."""
-    from mmsynth.fitting.trainer import pick_device
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.dataset import generate as dataset
     from mmsynth.operations.dataset import index as dataset_index
     from mmsynth.operations.output.work_partition import local_device, share_of_environment
@@ -251,7 +251,7 @@ def mesh(
     as_json: JsonOption = False,
 ) -> None:
     """The surface with every modality on it, in the input's frame and unit."""
-    from mmsynth.operations.mesh.extract import mesh_to_file
+    from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
     from mmsynth.report.text import mesh_text
     from mmsynth.workflows.runs import open_field, open_run
 
@@ -261,8 +261,9 @@ def mesh(
         opened = open_run(run)
         folder, field, scene = opened.folder, opened.field, opened.scene
     destination, at = out or folder / "mesh.ply", lengths(distances)
+    options = MeshOptions(
+        resolution, keep=keep_of(keep), closed=closed, attributes=not geometry_only, min_views=min_views, faces=faces, max_error=max_error
+    )
     with progress_bar("mesh", as_json) as show:
-        report = mesh_to_file(
-            field, destination, resolution, keep, closed, scene, not geometry_only, min_views, faces, max_error, against, at, show
-        )
+        report = mesh_to_file(field, destination, options, scene=scene, against=against, distances=at, progress=show)
     print(json.dumps(report) if as_json else mesh_text(report))

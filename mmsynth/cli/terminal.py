@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
 
 app = typer.Typer(
     add_completion=False,
@@ -23,7 +23,7 @@ app = typer.Typer(
 
 
 def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a command whose ``InputError`` becomes one sentence on stderr and exit code 2."""
+    """Register a command whose errors (``mmsynth.errors``) become one sentence on stderr and an exit code."""
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
         @of.command(name)
@@ -31,9 +31,9 @@ def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]],
         def guarded(*args: Any, **kwargs: Any) -> None:
             try:
                 function(*args, **kwargs)
-            except InputError as error:
+            except (InputError, DivergedError) as error:
                 print(f"error: {error}", file=sys.stderr)
-                raise typer.Exit(2) from None
+                raise typer.Exit(error.exit_code) from None
             except KeyboardInterrupt:
                 print("interrupted", file=sys.stderr)
                 raise typer.Exit(130) from None

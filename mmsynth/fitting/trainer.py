@@ -6,37 +6,26 @@ import functools
 import hashlib
 import json
 import math
-import os
-import platform
-import sys
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from mmsynth.errors import InputError
-from mmsynth.field import kernels, rendering
+from mmsynth.errors import DivergedError, InputError
+from mmsynth.field import rendering
 from mmsynth.field.field import Field
-from mmsynth.files import write_text
 from mmsynth.fitting import losses, probe
-from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
 from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
 from mmsynth.fitting.motions import Rows
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.optimiser import Adam, Average
-from mmsynth.fitting.recipe import Recipe, load_recipe
+from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, see
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
 from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
 from mmsynth.scene.scene import Scene
-from mmsynth.scene.serialisation import CONVENTIONS
-from mmsynth.version import __version__
 
-CHECKPOINT_SECONDS = 60.0
 PROBE_RAYS = 2048  # per modality
 _GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
@@ -44,7 +33,7 @@ _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its c
 
 
 @dataclass(frozen=True)
-class Progress:
+class FitProgress:
     """One line of news: ``done`` in [0, 1], running means of loss and PSNR [dB] per modality, speeds over the fit."""
 
     step: int
@@ -305,7 +294,7 @@ class Trainer:
         self.state.step += 1
         self.state.bad_steps += 1
         if self.state.bad_steps >= _BAD_STEPS:
-            raise InputError(f"fit: {reason} in {self.state.bad_steps} steps (last: step {self.state.step}); the checkpoint is kept.")
+            raise DivergedError(f"fit: {reason} in {self.state.bad_steps} steps (last: step {self.state.step}); the checkpoint is kept.")
 
     def gains(self) -> dict[str, list[float]]:
         """Exposure of each training frame relative to the mean, per modality; empty when no gains were needed."""
@@ -315,12 +304,12 @@ class Trainer:
         parts = self._gain().detach().cpu().split([len(self.measurements[n].origins) for n in order])
         return {n: part.tolist() for n, part in zip(order, parts, strict=True)}
 
-    def report(self) -> Progress:
+    def report(self) -> FitProgress:
         """News for a progress bar."""
         s = self.state
         psnr = {n: -10 * math.log10(max(e, 1e-12)) for n, e in self.mean_error.items()}
         rate = 1.0 / max(s.elapsed, 1e-9)
-        return Progress(s.step, self.progress, s.elapsed, self.mean_loss, psnr, s.rays_total * rate, s.samples_total * rate)
+        return FitProgress(s.step, self.progress, s.elapsed, self.mean_loss, psnr, s.rays_total * rate, s.samples_total * rate)
 
     def checkpoint(self) -> dict[str, Any]:
         """All state, as tensors and numbers."""
@@ -379,21 +368,6 @@ class Trainer:
         }
 
 
-def pick_device(name: str) -> str:
-    """``auto`` → cuda where there is one, else cpu.
-
-    Raises:
-        InputError: the device is unknown or not there.
-    """
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name not in ("cpu", "cuda"):
-        raise InputError(f"--device {name!r}: expected auto, cpu or cuda.")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: torch finds no CUDA device here; use cpu.")
-    return name
-
-
 def rig_of(scene: Scene) -> dict[str, np.ndarray]:
     """sensor → (4, 4) sensor_to_reference, from the first view that both saw; sensors that never shared a view are left out."""
     reference = next(iter(scene.sensors))
@@ -405,123 +379,3 @@ def rig_of(scene: Scene) -> dict[str, np.ndarray]:
                 rig[name] = np.linalg.inv(poses[frame.view]) @ frame.camera_to_world
                 break
     return rig
-
-
-def fit(
-    scene: Scene,
-    run: Path,
-    recipe: Recipe | None = None,
-    steps: int | None = None,
-    budget: float | None = None,
-    seed: int = 0,
-    device: str = "cpu",
-    resume: bool = False,
-    on_start: Callable[[Needs], None] | None = None,
-    on_step: Callable[[Progress], None] | None = None,
-) -> Field:
-    """Learn the field of a scene and write it into a run folder.
-
-    Args:
-        steps: length in optimiser steps, or ``budget``: length in seconds of training; when both are None, what a resumed
-            checkpoint was planned for, else 60 s.
-        resume: go on from the run's checkpoint, if it has one.
-        on_start: called once with what the scene was found to need. on_step: called after every step.
-    Raises:
-        InputError: the scene cannot be read, the run folder cannot be written, or a checkpoint does not fit.
-    """
-    saved = read_checkpoint(run) if resume else None
-    if steps is None and budget is None:
-        planned = saved["task"] if saved else {}
-        steps, budget = planned.get("steps") or None, planned.get("budget") or None
-        if steps is None and budget is None:
-            budget = 60.0
-    if device == "cpu":
-        kernels.announce_compilation()
-    trainer = Trainer(scene, recipe or load_recipe(None), steps, budget, seed, device)
-    log: list[str] = []
-    if saved is not None:
-        trainer.restore(saved)
-        if (run / "train.jsonl").is_file():
-            log = [x for x in (run / "train.jsonl").read_text().splitlines() if json.loads(x)["step"] <= trainer.state.step]
-    else:
-        # an empty checkpoint first: a run folder that cannot be written is known now and not after an hour
-        write_checkpoint(run, trainer.checkpoint())
-    if on_start is not None:
-        on_start(trainer.needs)
-    began, before = time.perf_counter(), trainer.state.elapsed
-    last_saved = last_logged = began
-    while trainer.progress < 1.0:
-        try:
-            trainer.run_step()
-        except KeyboardInterrupt:
-            # the step may be half applied: only the last checkpoint is safe to go on from
-            print(f"interrupted; go on with --resume from the checkpoint in {run}", file=sys.stderr)
-            raise
-        now = time.perf_counter()
-        trainer.state.elapsed = before + now - began
-        if on_step is not None:
-            on_step(trainer.report())
-        if now - last_logged > 1.0 or trainer.progress >= 1.0:
-            news = trainer.report()
-            log.append(json.dumps({"step": news.step, "elapsed": round(news.elapsed, 3), "loss": news.loss, "psnr": news.psnr}))
-            last_logged = now
-        if now - last_saved > CHECKPOINT_SECONDS:
-            write_checkpoint(run, trainer.checkpoint())
-            write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
-            last_saved = time.perf_counter()
-    write_checkpoint(run, trainer.checkpoint())
-    write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
-    return _finish(trainer, scene, run)
-
-
-def _finish(trainer: Trainer, scene: Scene, run: Path) -> Field:
-    field, news = trainer.field, trainer.report()
-    trainer.average.apply()
-    last = sampling_at(1.0, trainer.recipe, trainer.needs)
-    field.sampling = replace(last, step=last.step * trainer.recipe.rendered_step)
-    field.occupancy.update(
-        lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
-    )
-    field.corrections = trainer.refinement.corrections()
-    field.rig = {n: pose @ field.corrections.sensors.get(n, np.eye(4)) for n, pose in field.rig.items()}
-    field.manifest = {
-        "mmsynth": __version__,
-        "scene": {
-            "path": str(scene.root.resolve()),
-            "format": scene.format,
-            "hash": trainer.task["scene"],
-            "test_views": list(scene.split.test),
-        },
-        "recipe": trainer.recipe.model_dump(),
-        "needs": trainer.needs.to_json(),
-        "exposure": trainer.gains(),
-        "poses": _poses(trainer, scene),
-        "seed": trainer.seed,
-        "steps": trainer.state.step,
-        "seconds": {"fit": news.elapsed},
-        "rays_per_s": news.rays_per_s,
-        "samples_per_s": news.samples_per_s,
-        "train_psnr": news.psnr,
-        "skipped_steps": trainer.state.bad_steps,
-        "grid_reopened": trainer.state.reopened,
-        "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
-        "threads": torch.get_num_threads(),
-        "cores": os.cpu_count(),
-        "device": str(trainer.device),
-        "conventions": CONVENTIONS,
-    }
-    field.save(run)
-    return field
-
-
-def _poses(trainer: Trainer, scene: Scene) -> dict[str, Any]:
-    """Corrected poses and by how much: each training view that was moved, with its frames, and each sensor with its place on the rig."""
-    field, sizes = trainer.field, trainer.refinement.sizes()
-    frames = {n: scene.frames_of(n, scene.split.train) for n in field.sensors}
-    return {
-        "views": {
-            v: size | {"camera_to_world": {n: field.pose_of(f).tolist() for n, fs in frames.items() for f in fs if str(f.view) == v}}
-            for v, size in sizes["views"].items()
-        },
-        "sensors": {n: size | {"sensor_to_reference": field.rig[n].tolist()} for n, size in sizes["sensors"].items()},
-    }

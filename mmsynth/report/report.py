@@ -211,7 +211,7 @@ def _flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
 _RUN_FACTS = ("mmsynth", "seed", "steps", "seconds", "rays_per_s", "samples_per_s", "versions", "threads", "cores", "device")
 
 
-def write_report(
+def write_run_report(
     run_dir: Path | str,
     field: Field,
     evaluation: Mapping[str, Any] | None = None,

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.field import Field
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.trainer import fit
+from mmsynth.fitting.run import fit
 from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.output.work_partition import Share, local_device
 from mmsynth.operations.views.trajectories import load_views
-from mmsynth.report.report import write_report
+from mmsynth.report.report import write_run_report
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 
@@ -83,7 +83,7 @@ def run_batch(
             outcome = _one(scene, out / name, job)
             shown = ", ".join(f"{n} {v:.1f}" for n, v in outcome["train_psnr"].items())
             say(f"{name}: {shown} dB on training pixels, {time.perf_counter() - began:.0f} s")
-        except InputError as error:
+        except (InputError, DivergedError) as error:
             outcome = {"error": str(error)}
         except Exception as error:  # one scene must not take the others down, whatever it is
             outcome = {"error": f"{scene}: {type(error).__name__}: {error}"}
@@ -95,7 +95,7 @@ def run_batch(
 
 
 def _one(path: Path, out: Path, job: Job) -> dict[str, Any]:
-    scene = load_scene(path, job.modalities)
+    scene = load_scene(path, modalities=job.modalities)
     run = out / "run"
     field = _fitted(scene, run, job)
     made = None
@@ -109,6 +109,7 @@ def _fitted(scene: Scene, run: Path, job: Job) -> Field:
     if (run / "manifest.json").is_file():
         return Field.load(run, local_device(job.device))
     resume = (run / "checkpoint/state.pt").is_file()
-    field = fit(scene, run, job.recipe, job.steps, job.seconds, job.seed, local_device(job.device), resume)
-    write_report(run, field, scene=scene)
+    device = local_device(job.device)
+    field = fit(scene, run, recipe=job.recipe, steps=job.steps, budget=job.seconds, seed=job.seed, device=device, resume=resume)
+    write_run_report(run, field, scene=scene)
     return field

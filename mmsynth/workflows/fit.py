@@ -8,11 +8,11 @@ from typing import Any
 
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.trainer import Progress as FitProgress
-from mmsynth.fitting.trainer import fit
+from mmsynth.fitting.run import fit
+from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.progress import Progress
-from mmsynth.report.report import write_report
+from mmsynth.report.report import write_run_report
 from mmsynth.scene.scene import Scene
 from mmsynth.workflows.runs import Run, mark_latest, new_run, run_to_resume
 
@@ -21,7 +21,7 @@ def fit_run(
     scene: Scene,
     folder: Path | None = None,
     *,
-    recipe: Recipe | None = None,
+    recipe: Recipe | str | None = None,
     steps: int | None = None,
     budget: float | None = None,
     seed: int = 0,
@@ -39,8 +39,19 @@ def fit_run(
     """
     name = scene.root.resolve().name
     folder = folder or (run_to_resume(name) if resume else new_run(name))
-    field = fit(scene, folder, recipe, steps, budget, seed, device, resume, on_start, on_step)
-    write_report(folder, field, scene=scene)
+    field = fit(
+        scene,
+        folder,
+        recipe=recipe,
+        steps=steps,
+        budget=budget,
+        seed=seed,
+        device=device,
+        resume=resume,
+        on_start=on_start,
+        on_step=on_step,
+    )
+    write_run_report(folder, field, scene=scene)
     mark_latest(folder)
     return Run(folder, field, scene)
 
@@ -52,5 +63,5 @@ def evaluate_run(run: Run, *, progress: Progress | None = None) -> dict[str, Any
         InputError: as ``evaluate``.
     """
     scores = evaluate(run.field, run.scene, progress=progress)
-    write_report(run.folder, run.field, scores, scene=run.scene)
+    write_run_report(run.folder, run.field, scores, scene=run.scene)
     return scores

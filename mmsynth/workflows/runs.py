@@ -49,7 +49,7 @@ def open_run(folder: Path | None = None, *, device: str = "cpu") -> Run:
         InputError: as ``open_field``, or the scene cannot be read.
     """
     folder, field = open_field(folder, device=device)
-    return Run(folder, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors)))
+    return Run(folder, field, load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors)))
 
 
 def new_run(scene_name: str) -> Path:

@@ -14,8 +14,9 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.operations.conversion.files import source_views
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
@@ -34,7 +35,7 @@ def _recipe(**changes: object) -> Recipe:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(data_folder("example_scene"), ["rgb", "mono", "pol"])
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "mono", "pol"])
 
 
 def _disturbed(scene: Scene, views: float, sensors: float) -> Scene:
@@ -89,7 +90,7 @@ def test_exact_poses_are_left_alone(scene: Scene) -> None:
 @pytest.mark.parametrize(("views", "sensors"), [(1.5, 0.0), (0.0, 1.5)])
 def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, views: float, sensors: float) -> None:
     off = _disturbed(scene, views, sensors)
-    field = fit(off, tmp_path, _recipe(), steps=STEPS)
+    field = fit(off, tmp_path, recipe=_recipe(), steps=STEPS)
     evidence = field.manifest["needs"]["evidence"]
     assert evidence["poses"].startswith("on" if views else "off") and evidence["rig"].startswith("on" if sensors else "off"), evidence
     assert _pixels_off(off, field, scene) < 0.5 * _pixels_off(off, None, scene)
@@ -167,12 +168,12 @@ def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
     one = _run(Trainer(alone, _recipe(poses="on", poses_at=0.0), 10, None, 0, "cpu"))
     assert one.refinement.decided is not None and not one.refinement.decided["poses"]
     assert one.needs.evidence["poses"] == "off: there is one view"
-    single = Trainer(load_scene(data_folder("example_scene"), ["rgb"]), _recipe(rig="on", poses="off"), 10, None, 0, "cpu")
+    single = Trainer(load_scene(data_folder("example_scene"), modalities=["rgb"]), _recipe(rig="on", poses="off"), 10, None, 0, "cpu")
     assert single.needs.evidence["rig"] == "off: no two sensors share views"
 
 
 def test_the_evidence_is_in_the_manifest_and_the_checkpoint(scene: Scene, tmp_path: Path) -> None:
-    fit(scene, tmp_path, _recipe(), steps=60)
+    fit(scene, tmp_path, recipe=_recipe(), steps=60)
     evidence = json.loads((tmp_path / "manifest.json").read_text())["needs"]["evidence"]
     saved = read_checkpoint(tmp_path)
     assert saved is not None

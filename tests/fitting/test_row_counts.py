@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Design, Field
-from mmsynth.fitting import trainer as trainer_module
+from mmsynth.fitting import run as run_module
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
-from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region, Scene, Sensor
@@ -32,7 +33,7 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(data_folder("example_scene"), ["rgb", "nir"])
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "nir"])
 
 
 def _ball(radius: float, **sizes: Any) -> Field:
@@ -149,16 +150,16 @@ def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
 ) -> None:
     recipe = Recipe.model_validate(SMALL)
-    whole = fit(scene, tmp_path / "whole", recipe, steps=16)
-    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=16)
+    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
 
-    def kill(news: trainer_module.Progress) -> None:
+    def kill(news: FitProgress) -> None:
         if news.step == killed_at:
             raise RuntimeError("killed")
 
     with pytest.raises(RuntimeError, match="killed"):
-        fit(scene, tmp_path / "cut", recipe, steps=16, on_step=kill)
-    resumed = fit(scene, tmp_path / "cut", recipe, resume=True)
+        fit(scene, tmp_path / "cut", recipe=recipe, steps=16, on_step=kill)
+    resumed = fit(scene, tmp_path / "cut", recipe=recipe, resume=True)
     assert resumed.design == whole.design and resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
     for name, value in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], value), name

@@ -15,17 +15,19 @@ import pytest
 import torch
 from conftest import ring
 
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
 from mmsynth.field.surface import Surface
 from mmsynth.fitting import losses
-from mmsynth.fitting import trainer as trainer_module
+from mmsynth.fitting import run as run_module
 from mmsynth.fitting.checkpoint import read_checkpoint
+from mmsynth.fitting.device import pick_device
 from mmsynth.fitting.measurements import draw, load_measurements
 from mmsynth.fitting.recipe import Recipe, load_recipe
+from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
-from mmsynth.fitting.trainer import Trainer, fit, pick_device, rig_of
+from mmsynth.fitting.trainer import FitProgress, Trainer, rig_of
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.packaged import data_folder
 from mmsynth.scene.images import load_frame
@@ -91,7 +93,7 @@ def _ball_scene(folder: Path, picture: Picture, views: int = 6) -> Scene:
 
 
 def test_a_fit_learns_and_its_run_gives_the_same_field_back(scene: Scene, tmp_path: Path) -> None:
-    field = fit(scene, tmp_path / "run", SMALL, steps=300)
+    field = fit(scene, tmp_path / "run", recipe=SMALL, steps=300)
     assert set(field.sensors) == {"rgb", "nir", "mono", "pol", "ms"}
     for name, scores in evaluate(field, scene)["modalities"].items():
         raw = np.concatenate([load_frame(field.sensors[name], f)[0].ravel() for f in scene.frames_of(name, scene.split.test)])
@@ -119,7 +121,7 @@ def test_a_fit_with_a_background_learns_too(tmp_path: Path) -> None:
         return np.where(hit[..., None], 0.7, 0.5 + 0.4 * d)
 
     scene = _ball_scene(tmp_path, picture, 24)
-    field = fit(scene, tmp_path / "run", _recipe(background="on"), steps=600)
+    field = fit(scene, tmp_path / "run", recipe=_recipe(background="on"), steps=600)
     assert field.design.background and field.surface.grid.extent == 2.0
     (frame,) = scene.frames_of("rgb", scene.split.test)
     seen = field.render(frame.camera, frame.camera_to_world)
@@ -141,18 +143,18 @@ class Killed(Exception):
 @pytest.mark.parametrize("decide_at", [0.2, 0.8])  # before and after the kill
 def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decide_at: float) -> None:
     recipe = _recipe(decide_at=decide_at, view_dependence="auto", exposure="on", occupancy_every=5)
-    whole = fit(scene, tmp_path / "whole", recipe, steps=24, seed=3)
-    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=24, seed=3)
+    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
 
-    def kill(news: trainer_module.Progress) -> None:
+    def kill(news: FitProgress) -> None:
         if news.step == 13:
             raise Killed
 
     with pytest.raises(Killed):
-        fit(scene, tmp_path / "cut", recipe, steps=24, seed=3, on_step=kill)
+        fit(scene, tmp_path / "cut", recipe=recipe, steps=24, seed=3, on_step=kill)
     assert not (tmp_path / "cut" / "manifest.json").exists()
     news = []
-    resumed = fit(scene, tmp_path / "cut", recipe, seed=3, resume=True, on_step=news.append)
+    resumed = fit(scene, tmp_path / "cut", recipe=recipe, seed=3, resume=True, on_step=news.append)
     assert [n.step for n in news] == list(range(13, 25))  # the checkpoint of step 12 was the last before the kill
     expected = _tensors(whole)
     for name, value in _tensors(resumed).items():
@@ -165,7 +167,7 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, mo
 
 @pytest.mark.parametrize("average", [0.0, 0.2])
 def test_the_field_is_the_mean_over_the_last_steps(scene: Scene, tmp_path: Path, average: float) -> None:
-    field = fit(scene, tmp_path, _recipe(average=average), steps=30)
+    field = fit(scene, tmp_path, recipe=_recipe(average=average), steps=30)
     saved = read_checkpoint(tmp_path)
     assert saved is not None
     expected = {n.removeprefix("field."): m for n, m in saved["average"]["means"].items()} if average else saved["field"]
@@ -177,19 +179,19 @@ def test_the_field_is_the_mean_over_the_last_steps(scene: Scene, tmp_path: Path,
 
 def test_the_log_of_a_resumed_fit_has_every_step_once(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit is killed after a log line and before its checkpoint: that line is written again, not twice."""
-    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
     ticks = iter(float(i) * 2 for i in range(10_000))
-    monkeypatch.setattr(trainer_module, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))  # a log line every step
+    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))  # a log line every step
 
-    def kill(news: trainer_module.Progress) -> None:
+    def kill(news: FitProgress) -> None:
         if news.step == 5:
             raise Killed
 
     with pytest.raises(Killed):
-        fit(scene, tmp_path, SMALL, steps=8, on_step=kill)
+        fit(scene, tmp_path, recipe=SMALL, steps=8, on_step=kill)
     log = tmp_path / "train.jsonl"
     log.write_text(log.read_text() + json.dumps({"step": 7, "elapsed": 0.0, "loss": 1.0, "psnr": {}}) + "\n")
-    fit(scene, tmp_path, SMALL, steps=8, resume=True)
+    fit(scene, tmp_path, recipe=SMALL, steps=8, resume=True)
     lines = [json.loads(x) for x in log.read_text().splitlines()]
     assert [x["step"] for x in lines] == list(range(1, 9))
     assert all(math.isfinite(x["loss"]) and set(x["psnr"]) == set(scene.sensors) for x in lines)
@@ -207,40 +209,40 @@ def test_an_interrupted_fit_says_how_to_go_on(
 
     monkeypatch.setattr(Trainer, "run_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        fit(scene, tmp_path, SMALL, steps=5)
+        fit(scene, tmp_path, recipe=SMALL, steps=5)
     assert "--resume" in capsys.readouterr().err
     saved = read_checkpoint(tmp_path)
     assert saved is not None and saved["state"]["step"] == 0  # none of the steps since was saved, none of them half done
 
 
 def test_the_seed_decides_the_field(scene: Scene, tmp_path: Path) -> None:
-    a, b, c = (_tensors(fit(scene, tmp_path / str(i), SMALL, steps=6, seed=s)) for i, s in enumerate((0, 0, 1)))
+    a, b, c = (_tensors(fit(scene, tmp_path / str(i), recipe=SMALL, steps=6, seed=s)) for i, s in enumerate((0, 0, 1)))
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert not torch.equal(a["appearance.table"], c["appearance.table"])
 
 
 def test_a_checkpoint_of_another_fit_is_refused(scene: Scene, tmp_path: Path) -> None:
-    fit(scene, tmp_path, SMALL, steps=3)
+    fit(scene, tmp_path, recipe=SMALL, steps=3)
     with pytest.raises(InputError, match="seed"):
-        fit(scene, tmp_path, SMALL, steps=3, seed=1, resume=True)
+        fit(scene, tmp_path, recipe=SMALL, steps=3, seed=1, resume=True)
     with pytest.raises(InputError, match="steps"):
-        fit(scene, tmp_path, SMALL, steps=5, resume=True)
+        fit(scene, tmp_path, recipe=SMALL, steps=5, resume=True)
     with pytest.raises(InputError, match="recipe"):
-        fit(scene, tmp_path, _recipe(eikonal=0.2), steps=3, resume=True)
+        fit(scene, tmp_path, recipe=_recipe(eikonal=0.2), steps=3, resume=True)
     with pytest.raises(InputError, match="scene"):
-        fit(load_scene(data_folder("example_scene"), ["rgb"]), tmp_path, SMALL, steps=3, resume=True)
+        fit(load_scene(data_folder("example_scene"), modalities=["rgb"]), tmp_path, recipe=SMALL, steps=3, resume=True)
     (tmp_path / "checkpoint" / "state.pt").write_bytes(b"broken")
     with pytest.raises(InputError, match="not a readable checkpoint"):
-        fit(scene, tmp_path, SMALL, steps=3, resume=True)
+        fit(scene, tmp_path, recipe=SMALL, steps=3, resume=True)
 
 
 # --- length
 
 
 def test_a_fit_takes_the_steps_it_was_given(scene: Scene, tmp_path: Path) -> None:
-    news: list[trainer_module.Progress] = []
+    news: list[FitProgress] = []
     started = []
-    fit(scene, tmp_path, SMALL, steps=7, on_start=started.append, on_step=news.append)
+    fit(scene, tmp_path, recipe=SMALL, steps=7, on_start=started.append, on_step=news.append)
     assert [n.step for n in news] == list(range(1, 8))
     np.testing.assert_allclose([n.done for n in news], np.arange(1, 8) / 7)
     assert len(started) == 1 and started[0].design.surface_levels == 4
@@ -250,21 +252,21 @@ def test_a_fit_takes_the_steps_it_was_given(scene: Scene, tmp_path: Path) -> Non
 def test_a_budget_ends_a_fit_by_the_clock(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that goes on by a second each time it is asked."""
     ticks = iter(range(10_000))
-    monkeypatch.setattr(trainer_module, "time", SimpleNamespace(perf_counter=lambda: float(next(ticks))))
-    news: list[trainer_module.Progress] = []
+    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: float(next(ticks))))
+    news: list[FitProgress] = []
 
-    def kill(n: trainer_module.Progress) -> None:
+    def kill(n: FitProgress) -> None:
         news.append(n)
         if n.step == 4:
             raise Killed
 
-    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(Killed):
-        fit(scene, tmp_path, SMALL, budget=12.0, on_step=kill)
+        fit(scene, tmp_path, recipe=SMALL, budget=12.0, on_step=kill)
     assert all(n.done == pytest.approx(n.elapsed / 12.0) for n in news)
     before = news[2].elapsed
     news.clear()
-    field = fit(scene, tmp_path, SMALL, resume=True, on_step=news.append)  # the budget is the checkpoint's
+    field = fit(scene, tmp_path, recipe=SMALL, resume=True, on_step=news.append)  # the budget is the checkpoint's
     assert news[0].step == 4 and before < news[0].elapsed < news[-1].elapsed
     assert news[-1].done == 1.0 and all(n.done < 1.0 for n in news[:-1]) and 12.0 <= news[-1].elapsed < 16.0
     assert field.manifest["seconds"]["fit"] == news[-1].elapsed
@@ -342,8 +344,8 @@ def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, mo
         return loss * (torch.nan if len(calls) in (1, 4) else 1.0), squared
 
     monkeypatch.setattr(losses, "compare", sometimes)
-    news: list[trainer_module.Progress] = []
-    field = fit(scene, tmp_path, SMALL, steps=6, on_step=news.append)
+    news: list[FitProgress] = []
+    field = fit(scene, tmp_path, recipe=SMALL, steps=6, on_step=news.append)
     assert field.manifest["skipped_steps"] == 2 and field.manifest["steps"] == 6
     assert all(math.isfinite(n.loss) for n in news[1:]), "a first step that was skipped leaves nothing in the running mean"
 
@@ -352,7 +354,7 @@ def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -
     trainer = _trainer(scene, 100)
     with torch.no_grad():
         trainer.field.surface.output_weight[-1] = torch.nan
-    with pytest.raises(InputError, match="not finite in 20 steps"):
+    with pytest.raises(DivergedError, match="not finite in 20 steps"):
         for _ in range(100):
             trainer.run_step()
     assert trainer.state.step == 20
@@ -412,7 +414,7 @@ def test_an_object_on_black_is_found(tmp_path: Path) -> None:
         folder = tmp_path / picture.__name__
         folder.mkdir()
         scene = _ball_scene(folder, picture)
-        field = fit(scene, folder / "run", SMALL, steps=200)
+        field = fit(scene, folder / "run", recipe=SMALL, steps=200)
         frame = scene.frames_of("rgb", (5,))[0]
         seen = field.render(frame.camera, frame.camera_to_world)
         v, u = np.mgrid[:18, :24]
@@ -467,7 +469,7 @@ def test_only_needed_parts_are_built(scene: Scene) -> None:
     forced = _trainer(scene, background="on")
     assert forced.field.design.background and "asked for by the recipe" in forced.needs.evidence["background"]
     assert forced.field.surface.grid.extent == forced.field.appearance.extent == forced.field.occupancy.extent == 2.0
-    rgb = load_scene(data_folder("example_scene"), ["rgb"])
+    rgb = load_scene(data_folder("example_scene"), modalities=["rgb"])
     assert _trainer(rgb).needs.evidence["tensor_head"].startswith("off")
 
 

@@ -17,7 +17,7 @@ from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.fitting import motions
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.trainer import fit
+from mmsynth.fitting.run import fit
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
@@ -28,7 +28,7 @@ Row = Callable[[str, str, str], None]
 
 def _fit(folder: Path, poses: dict[str, list[np.ndarray]], steps: int = 40, recipe: Recipe = QUICK, **how: Any) -> Field:
     """A short fit of a scene on disk; every number that it leaves is finite."""
-    field = fit(load_scene(write_scene(folder / "scene", poses, **how)), folder / "run", recipe, steps=steps)
+    field = fit(load_scene(write_scene(folder / "scene", poses, **how)), folder / "run", recipe=recipe, steps=steps)
     assert all(torch.isfinite(p).all() for p in field.parameters())
     assert field.manifest["skipped_steps"] == 0
     assert all(math.isfinite(x) for x in field.manifest["train_psnr"].values())
@@ -196,7 +196,7 @@ def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
         for name, below in (("joint", 0.0), ("ours", QUICK.scarce_below)):
             folder = write_scene(tmp_path / "scene", poses, alter=wrong)
             recipe = Recipe.model_validate({**QUICK.model_dump(), "scarce_below": below})
-            field = fit(load_scene(folder), tmp_path / "run", recipe, steps=200, seed=seed)
+            field = fit(load_scene(folder), tmp_path / "run", recipe=recipe, steps=200, seed=seed)
             assert field.manifest["needs"]["scarce"] == (("mono",) if name == "ours" else ())
             psnr[name].append(evaluate(field, load_scene(folder))["modalities"]["rgb"]["psnr"])
     gains = np.subtract(psnr["ours"], psnr["joint"])

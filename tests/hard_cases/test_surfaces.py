@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.operations.mesh.extract import extract_mesh
+from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
 from mmsynth.scene.scene import Region, Sensor
 
 Row = Callable[[str, str, str], None]
@@ -40,7 +40,7 @@ def test_a_surface_through_lattice_points(row: Row, radius: float) -> None:
     v, f, _, _ = marching_cubes(_distances(np.linspace(-1, 1, n + 1), radius), 0.0)
     collapsed = int((np.linalg.norm(np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1) < 1e-9).sum())
     assert collapsed > 0
-    mesh = extract_mesh(_ball(radius), n, 8)
+    mesh = extract_mesh(_ball(radius), MeshOptions(n, 8))
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.area_faces.min() > 0
     row(f"a ball of {radius} through lattice points", f"{collapsed} triangles without area", "closed, every triangle with an area")
 
@@ -48,7 +48,7 @@ def test_a_surface_through_lattice_points(row: Row, radius: float) -> None:
 def test_where_a_surface_is_and_which_way_it_faces(row: Row) -> None:
     """Half a cell off, inside out: the usual two mistakes. World frame, off the origin, in any unit."""
     region = Region((300.0, -20.0, 5.0), 1000.0)
-    mesh = extract_mesh(_ball(0.5, region), 64, 32)
+    mesh = extract_mesh(_ball(0.5, region), MeshOptions(64, 32))
     distance = np.linalg.norm(mesh.vertices - np.array(region.centre), axis=1)
     off = np.abs(distance - 500.0).max()
     outward = np.einsum("fi,fi->f", mesh.face_normals, mesh.triangles_center - np.array(region.centre))
@@ -86,7 +86,7 @@ def test_the_lattice_is_finer_than_half_precision(row: Row) -> None:
 
 def test_blocks_and_the_border_leave_no_holes(row: Row) -> None:
     """The surface crosses many blocks, and comes near the lattice's own border."""
-    mesh = extract_mesh(_ball(0.97), 48, 7)
+    mesh = extract_mesh(_ball(0.97), MeshOptions(48, 7))
     assert mesh.is_watertight and len(mesh.split(only_watertight=False)) == 1
     # blocks that share their planes, each marched alone and put together, as MultimodalStudio and sdfstudio do
     values, parts = _distances(np.linspace(-1, 1, 50), 0.97), []
@@ -106,7 +106,7 @@ def test_no_surface_is_said(row: Row, level: float) -> None:
     with torch.no_grad():
         field.surface.output_weight[-1] = level
     with pytest.raises(InputError, match="no surface in the region"):
-        extract_mesh(field, 16, 8)
+        extract_mesh(field, MeshOptions(16, 8))
     with pytest.raises(ValueError, match="within volume data range"):
         marching_cubes(np.full((17, 17, 17), level, np.float32), 0.0)
     row(

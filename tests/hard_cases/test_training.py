@@ -12,15 +12,16 @@ import torch
 from small_scenes import QUICK, RADIUS, around, picture, write_scene
 from usual import nerfacc_keeps, neus_weights
 
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError
 from mmsynth.field.kernels import OUTSIDE, SHELL
 from mmsynth.field.rendering import ball_interval, trace_by_parts
 from mmsynth.fitting import losses
-from mmsynth.fitting import trainer as trainer_module
+from mmsynth.fitting import run as run_module
 from mmsynth.fitting.measurements import draw
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.trainer import Trainer, fit
+from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
@@ -97,7 +98,7 @@ def test_nothing_but_bad_steps_is_given_up(row: Row, scene: Scene, table: str) -
     trainer = _trainer(scene)
     with torch.no_grad():
         dict(trainer.field.named_parameters())[table].fill_(math.inf)
-    with pytest.raises(InputError, match="not finite in 20 steps"):
+    with pytest.raises(DivergedError, match="not finite in 20 steps"):
         while trainer.progress < 1:
             trainer.run_step()
     assert trainer.state.step == 20
@@ -126,17 +127,17 @@ def _resumed_from_parameters(scene: Scene, recipe: Recipe, at: int) -> float:
 def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed where levels open, tables are sized, directions are decided."""
     recipe = Recipe.model_validate({**QUICK.model_dump(), "poses": "on"})
-    whole = fit(scene, tmp_path / "whole", recipe, steps=40)
-    monkeypatch.setattr(trainer_module, "CHECKPOINT_SECONDS", 0.0)
+    whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=40)
+    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
     for at in (1, 3, 13, 25, 39):
 
-        def kill(news: trainer_module.Progress, at: int = at) -> None:
+        def kill(news: FitProgress, at: int = at) -> None:
             if news.step == at:
                 raise RuntimeError("killed")
 
         with pytest.raises(RuntimeError, match="killed"):
-            fit(scene, tmp_path / f"cut{at}", recipe, steps=40, on_step=kill)
-        resumed = fit(scene, tmp_path / f"cut{at}", recipe, resume=True)
+            fit(scene, tmp_path / f"cut{at}", recipe=recipe, steps=40, on_step=kill)
+        resumed = fit(scene, tmp_path / f"cut{at}", recipe=recipe, resume=True)
         assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True)), at
     off = _resumed_from_parameters(scene, Recipe.model_validate({**QUICK.model_dump(), "tables_at": 0}), 25)
     assert off > 0.005

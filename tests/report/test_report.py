@@ -12,7 +12,7 @@ import pytest
 from analytic import AnalyticField, scene_of, sphere
 
 from mmsynth.operations.evaluation.evaluate import evaluate
-from mmsynth.report.report import curve_svg, measured_channels, read_log, write_report
+from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
 from mmsynth.scene.images import write_png16
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
@@ -24,7 +24,7 @@ def test_report(tmp_path: Path) -> None:
     field.manifest = {"needs": {"evidence": {"background": "off: <nothing> there"}, "footprint": 0.01}, "seed": 7, "seconds": {"fit": 60.5}}
     log = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
     evaluation = evaluate(field, scene)  # type: ignore[arg-type]
-    page = write_report(tmp_path, field, evaluation, log, scene).read_text()  # type: ignore[arg-type]
+    page = write_run_report(tmp_path, field, evaluation, log, scene).read_text()  # type: ignore[arg-type]
     assert page.count("data:image/png;base64,") == 3 * 4 + 2 + 3  # frame, rendering, difference; polarization; geometry
     assert (tmp_path / "preview.png").is_file()
     assert "&lt;nothing&gt;" in page and "<nothing>" not in page
@@ -35,7 +35,7 @@ def test_report(tmp_path: Path) -> None:
 
 def test_report_of_a_bare_run(tmp_path: Path) -> None:
     """No scene, no scores, no log: still a page."""
-    page = write_report(tmp_path, AnalyticField(sphere())).read_text()  # type: ignore[arg-type]
+    page = write_run_report(tmp_path, AnalyticField(sphere())).read_text()  # type: ignore[arg-type]
     assert "<h1>" in page and "<svg" not in page
 
 

@@ -29,7 +29,7 @@ where nothing was seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +40,8 @@ from mmsynth.errors import InputError
 from mmsynth.operations.output import previews
 from mmsynth.operations.output.progress import Counter, Progress, parts
 from mmsynth.operations.views.visibility import inside
-from mmsynth.sensors.camera import Camera, project, resized
+from mmsynth.scene.scene import PosedCamera
+from mmsynth.sensors.camera import project, resized
 from mmsynth.sensors.polarization import reference_axes, stokes_to_coherency
 
 if TYPE_CHECKING:
@@ -55,32 +56,31 @@ _CHUNK = 1 << 16  # vertices at a time
 _UNSEEN = 128
 
 
-def views_of(field: Field, scene: Scene) -> list[tuple[Camera, np.ndarray]]:
+def training_views(field: Field, scene: Scene) -> list[PosedCamera]:
     """Camera and pose (as the fit corrected it) of every training view: of the first sensor that has a frame in it.
 
     Raises:
         InputError: the scene has none.
     """
-    frames: dict[int, tuple[Camera, np.ndarray]] = {}
+    frames: dict[int, PosedCamera] = {}
     for sensor in scene.sensors:
         for frame in scene.frames_of(sensor, scene.split.train):
-            frames.setdefault(frame.view, (frame.camera, field.pose_of(frame)))
+            frames.setdefault(frame.view, PosedCamera(frame.camera, field.pose_of(frame)))
     if not frames:
         raise InputError(f"{scene.root}: no training views, from which the mesh's attributes are seen.")
     return [frames[view] for view in sorted(frames)]
 
 
-def small(camera: Camera) -> Camera:
+def coarse(view: PosedCamera) -> PosedCamera:
     """The same view on the grid of a depth map."""
-    return resized(camera, min(_COLUMNS, camera.width))
+    return replace(view, camera=resized(view.camera, min(_COLUMNS, view.camera.width)))
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera, its pose (4, 4) camera_to_world, and what it sees: depth_ray (H, W), distance along the ray, NaN = nothing; scene unit."""
+    """A camera at its place and what it sees: depth_ray (H, W), distance along the ray, NaN = nothing; scene unit."""
 
-    camera: Camera
-    pose: np.ndarray
+    posed: PosedCamera
     depth_ray: np.ndarray
 
     def sees(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -91,16 +91,17 @@ class View:
         Returns:
             (N,) float64: cosine between normal and ray where the point is seen, 0 where not.
         """
-        away = points - self.pose[:3, 3]
+        camera, pose = self.posed.camera, self.posed.camera_to_world
+        away = points - pose[:3, 3]
         distance = np.linalg.norm(away, axis=1)
         cosine = -np.einsum("ni,ni->n", away, normals) / np.where(distance > 0, distance, 1.0)
         out = np.zeros(len(points))
         rows = np.flatnonzero(cosine > _GRAZING)
-        pixels = project(away[rows] @ self.pose[:3, :3], self.camera)
-        within = inside(pixels, self.camera)
+        pixels = project(away[rows] @ pose[:3, :3], camera)
+        within = inside(pixels, camera)
         rows, pixels = rows[within], np.rint(pixels[within]).astype(np.int64)
         met = self.depth_ray[pixels[:, 1], pixels[:, 0]]
-        footprint = distance[rows] / min(self.camera.fx, self.camera.fy)
+        footprint = distance[rows] / min(camera.fx, camera.fy)
         rows = rows[np.abs(distance[rows] - met) <= footprint / cosine[rows] + _AGREES * distance[rows]]
         out[rows] = cosine[rows]
         return out
@@ -108,11 +109,10 @@ class View:
 
 def depth_maps(field: Field, scene: Scene, progress: Progress | None = None) -> list[View]:
     """What each training view sees; ``progress``: called with (views done, views in all)."""
-    views = views_of(field, scene)
+    views = training_views(field, scene)
     out = []
-    for done, (camera, pose) in enumerate(views, 1):
-        coarse = small(camera)
-        out.append(View(coarse, pose, field.render(coarse, pose, []).depth_ray))
+    for done, view in enumerate(map(coarse, views), 1):
+        out.append(View(view, field.render(view.camera, view.camera_to_world, []).depth_ray))
         if progress is not None:
             progress(done, len(views))
     return out
@@ -191,12 +191,13 @@ def _of_part(
     asked = _evenly(cosines, rays)
     for i, view in enumerate(views):
         rows = np.flatnonzero(asked[i])
-        away = points[rows] - view.pose[:3, 3]
+        pose = view.posed.camera_to_world
+        away = points[rows] - pose[:3, 3]
         distance = np.linalg.norm(away, axis=1)
         directions = away / distance[:, None]
-        cast = field.cast(directions @ view.pose[:3, :3], view.pose, [s.name for s in sensors], geometry=True)
+        cast = field.cast(directions @ pose[:3, :3], pose, [s.name for s in sensors], geometry=True)
         met = np.abs(cast["depth"] * field.region.radius - distance) <= _AGREES * distance  # NaN (no hit) is not
-        sums.add(rows[met], {key: value[met] for key, value in cast.items()}, directions[met], view.pose[:3, 0])
+        sums.add(rows[met], {key: value[met] for key, value in cast.items()}, directions[met], pose[:3, 0])
     return _means(sums, sensors, (cosines > 0).sum(0), np.abs(field.sdf(points)) / cell)
 
 

@@ -13,7 +13,7 @@ from analytic import MONO, AnalyticField, Distance, sphere, torus
 from mmsynth.errors import InputError
 from mmsynth.operations.mesh import decimation
 from mmsynth.operations.mesh.decimation import decimate_to, decimate_within
-from mmsynth.operations.mesh.extract import extract_mesh
+from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
 from mmsynth.operations.mesh.topology import topology
 
 BACKENDS = ["fast-simplification", *(["pymeshlab"] if importlib.util.find_spec("pymeshlab") else [])]
@@ -27,7 +27,7 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def mesh_of(distance: Distance, resolution: int = 48, **options: Any) -> trimesh.Trimesh:
-    return extract_mesh(AnalyticField(distance, [MONO]), resolution, 16, **options)  # type: ignore[arg-type]
+    return extract_mesh(AnalyticField(distance, [MONO]), MeshOptions(resolution, 16, **options))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("distance", "euler"), [(sphere(0.6), 2), (torus(), 0)])

@@ -17,16 +17,16 @@ from skimage.measure import marching_cubes
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
 from mmsynth.field.rendering import Sampling
-from mmsynth.operations.mesh.extract import extract_mesh, settle
+from mmsynth.operations.mesh.extract import Kept, MeshOptions, extract_mesh, settle
 from mmsynth.operations.mesh.marching import march, steepest
-from mmsynth.operations.mesh.report import describe
+from mmsynth.operations.mesh.quality import describe_mesh
 from mmsynth.scene.scene import Region
 
 UNIT = Region((0.0, 0.0, 0.0), 1.0)
 
 
 def mesh_of(distance: Distance, resolution: int = 48, block: int = 16, region: Region | None = None, **options: Any) -> trimesh.Trimesh:
-    return extract_mesh(AnalyticField(distance, [MONO], region), resolution, block, **options)  # type: ignore[arg-type]
+    return extract_mesh(AnalyticField(distance, [MONO], region), MeshOptions(resolution, block, **options))  # type: ignore[arg-type]
 
 
 def rippled(p: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ def test_no_part_of_a_learned_field_is_lost(seed: int) -> None:
     v, _ = march(field.sdf, UNIT, n, 16)
     whole, _ = dense(lambda p: field.sdf(p.reshape(-1, 3)).reshape(p.shape[:-1]), n)
     assert crossed(v, n) == crossed(whole, n) and len(crossed(v, n)) > 5000
-    closed = extract_mesh(field, n, 16, keep="all", closed=True)
+    closed = extract_mesh(field, MeshOptions(n, 16, keep="all", closed=True))
     assert closed.is_watertight and closed.body_count > 3
 
 
@@ -172,7 +172,7 @@ def test_a_sheet_thinner_than_a_cell_is_cut_where_it_falls_between_and_stays_clo
 def test_memory_follows_the_block() -> None:
     fields = {n: AnalyticField(sphere(0.6), [MONO]) for n in (64, 256)}
     for n, field in fields.items():
-        extract_mesh(field, n, 16)  # type: ignore[arg-type]
+        extract_mesh(field, MeshOptions(n, 16))  # type: ignore[arg-type]
     asked = {n: field.points for n, field in fields.items()}
     assert asked[256] < 24 * asked[64]  # 4² times the surface, not 4³ times the volume
     assert asked[256] < 0.5 * 257**3
@@ -191,7 +191,7 @@ def plane(p: np.ndarray) -> np.ndarray:
 
 def test_a_plane_that_cuts_the_border_stays_open() -> None:
     mesh = mesh_of(plane)
-    report = describe(mesh)
+    report = describe_mesh(mesh)
     assert not report["watertight"] and report["volume"] is None and report["boundary_edges"] > 50
     assert np.linalg.norm(mesh.vertices, axis=1).max() < 1 + 2 * 2 / 48  # nothing outside
     assert np.average(mesh.face_normals, 0, mesh.area_faces) @ [-0.1, 0, 1] > 0.99
@@ -230,10 +230,10 @@ def three(p: np.ndarray) -> np.ndarray:
     return np.minimum(np.minimum(sphere(0.5)(p), sphere(0.1, (0.75, 0.0, 0.0))(p)), sphere(0.012, (-0.8, 0.0, 0.0))(p))
 
 
-@pytest.mark.parametrize(("keep", "bodies"), [("all", 3), ("clean", 2), ("largest", 1), ("2", 2), ("9", 3)])
-def test_components_by_size(keep: str, bodies: int) -> None:
+@pytest.mark.parametrize(("keep", "bodies"), [("all", 3), ("clean", 2), ("largest", 1), (2, 2), (9, 3)])
+def test_components_by_size(keep: Kept | int, bodies: int) -> None:
     mesh = mesh_of(three, 96, 32, keep=keep)
-    assert mesh.body_count == bodies == describe(mesh)["components"]
+    assert mesh.body_count == bodies == describe_mesh(mesh)["components"]
     assert np.abs(mesh.vertices).min(0).max() < 0.5 and np.linalg.norm(mesh.vertices, axis=1).max() < 0.9
 
 

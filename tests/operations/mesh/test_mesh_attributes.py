@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mmsynth.errors import InputError
-from mmsynth.operations.mesh.attributes import View, add_attributes, depth_maps, polarized_part, small, views_of, views_that_see
-from mmsynth.operations.mesh.extract import extract_mesh
-from mmsynth.scene.scene import Scene, Split
+from mmsynth.operations.mesh.attributes import View, add_attributes, coarse, depth_maps, polarized_part, training_views, views_that_see
+from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
+from mmsynth.scene.scene import PosedCamera, Scene, Split
 from mmsynth.sensors.camera import Camera, project, ray_map
 from mmsynth.sensors.polarization import stokes_to_coherency
 
@@ -37,7 +37,7 @@ def baked(tmp_path_factory: pytest.TempPathFactory) -> tuple[trimesh.Trimesh, An
     field = AnalyticField(sphere(0.6), (RGB, MS, POL, MONO))
     field.cameras = dict.fromkeys(field.cameras, FINE)
     scene = scene_of(field, tmp_path_factory.mktemp("scene"), views=9)
-    mesh = extract_mesh(field, 40, scene=scene)  # type: ignore[arg-type]
+    mesh = extract_mesh(field, MeshOptions(40), scene=scene)  # type: ignore[arg-type]
     return mesh, field, scene
 
 
@@ -121,7 +121,7 @@ def test_the_polarized_part_is_the_tensor_of_the_fully_polarized_light(degree: f
 def test_a_view_sees_what_faces_it_in_its_image_and_is_not_behind(tmp_path: Path) -> None:
     field = AnalyticField(sphere(0.6), (MONO,))
     camera, pose = FINE, ring_pose(0, 4)
-    view = View(camera, pose, field.render(camera, pose, []).depth_ray)
+    view = View(PosedCamera(camera, pose), field.render(camera, pose, []).depth_ray)
     rng = np.random.default_rng(0)
     points = rng.normal(size=(2000, 3))
     points *= 0.6 / np.linalg.norm(points, axis=1, keepdims=True)
@@ -134,16 +134,17 @@ def test_a_view_sees_what_faces_it_in_its_image_and_is_not_behind(tmp_path: Path
     assert np.abs(cosine - true)[cosine > 0].max() < 1e-12
     assert not view.sees(points * 0.8, points / 0.6).any()  # inside
     assert not view.sees(points, np.full_like(points, np.nan)).any()
-    beside = View(camera, look_at((2.2, 0.0, 1.0), (2.2, 3.0, 1.0)), view.depth_ray)
+    beside = View(PosedCamera(camera, look_at((2.2, 0.0, 1.0), (2.2, 3.0, 1.0))), view.depth_ray)
     assert not beside.sees(points, points / 0.6).any()
 
 
 def test_small_cameras_look_the_same_way() -> None:
     camera = Camera(1000, 700, 900.0, 880.0, 510.0, 340.0, (-0.1, 0.02, 1e-3, 0.0))
-    coarse = small(camera)
-    assert (coarse.width, coarse.height) == (160, 112) and small(coarse) == coarse
-    rays = ray_map(coarse)[0][::20, ::20].reshape(-1, 3)
-    at, fine = project(rays, coarse), project(rays, camera)
+    view = coarse(PosedCamera(camera, np.eye(4)))
+    small = view.camera
+    assert (small.width, small.height) == (160, 112) and coarse(view).camera == small
+    rays = ray_map(small)[0][::20, ::20].reshape(-1, 3)
+    at, fine = project(rays, small), project(rays, camera)
     assert np.abs((at + 0.5) * [1000 / 160, 700 / 112] - 0.5 - fine).max() < 1e-6
 
 
@@ -151,22 +152,22 @@ def test_components_by_visibility(tmp_path: Path) -> None:
     field = AnalyticField(hollow, (MONO,))
     field.cameras = {"mono": FINE}
     scene = scene_of(field, tmp_path, views=6, truth=False)
-    every = extract_mesh(field, 48, keep="all")  # type: ignore[arg-type]
+    every = extract_mesh(field, MeshOptions(48, keep="all"))  # type: ignore[arg-type]
     assert every.body_count == 3  # the shell outside and inside, and the ball in it
-    seen = extract_mesh(field, 48, keep="all", scene=scene, attributes=False, min_views=2)  # type: ignore[arg-type]
+    seen = extract_mesh(field, MeshOptions(48, keep="all", attributes=False, min_views=2), scene=scene)  # type: ignore[arg-type]
     assert seen.body_count == 1 and np.linalg.norm(seen.vertices, axis=1).min() > 0.53
     assert not seen.vertex_attributes
     with pytest.raises(InputError, match="at most the 5 training views"):
-        extract_mesh(field, 48, scene=scene, min_views=6)  # type: ignore[arg-type]
+        extract_mesh(field, MeshOptions(48, min_views=6), scene=scene)  # type: ignore[arg-type]
     away = replace(scene, frames=tuple(replace(f, camera_to_world=look_at((2.0, 0.0, 0.0), (4.0, 0.0, 0.0))) for f in scene.frames))
     with pytest.raises(InputError, match=r"no surface .* that 1 training views see"):
-        extract_mesh(field, 48, scene=away, min_views=1)  # type: ignore[arg-type]
+        extract_mesh(field, MeshOptions(48, min_views=1), scene=away)  # type: ignore[arg-type]
 
 
 def test_attributes_are_asked_at_the_final_vertices(tmp_path: Path) -> None:
     field = AnalyticField(sphere(0.6), (MONO,))
     scene = scene_of(field, tmp_path, views=6, truth=False)
-    mesh = extract_mesh(field, 48, scene=scene, faces=600)  # type: ignore[arg-type]
+    mesh = extract_mesh(field, MeshOptions(48, faces=600), scene=scene)  # type: ignore[arg-type]
     assert len(mesh.faces) == 600 and np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.6).max() < 1e-5
     seen = mesh.vertex_attributes["confidence"] > 0
     assert np.abs(mesh.vertex_attributes["mono_0"] - shade(field.normal(mesh.vertices)))[seen].max() < 0.02
@@ -176,11 +177,11 @@ def test_views_are_one_place_of_the_rig_each(tmp_path: Path) -> None:
     field = AnalyticField(sphere(0.6), (RGB, MONO))
     scene = scene_of(field, tmp_path, views=5, truth=False)
     without = replace(scene, frames=tuple(f for f in scene.frames if (f.sensor, f.view) != ("rgb", 1)))
-    views = views_of(field, without)  # type: ignore[arg-type]
+    views = training_views(field, without)  # type: ignore[arg-type]
     assert len(views) == 4
-    assert np.array_equal(views[0][1], ring_pose(0, 5) @ field.rig["rgb"])
-    assert np.array_equal(views[1][1], ring_pose(1, 5) @ field.rig["mono"])  # the first sensor that has the view
+    assert np.array_equal(views[0].camera_to_world, ring_pose(0, 5) @ field.rig["rgb"])
+    assert np.array_equal(views[1].camera_to_world, ring_pose(1, 5) @ field.rig["mono"])  # the first sensor that has the view
     maps = depth_maps(field, without)  # type: ignore[arg-type]
     assert views_that_see(maps, np.array([[0.0, 0.0, 0.6]]), np.array([[0.0, 0.0, 1.0]])).astype(bool).all()
     with pytest.raises(InputError, match="no training views"):
-        views_of(field, replace(scene, split=Split((), (0,), "")))  # type: ignore[arg-type]
+        training_views(field, replace(scene, split=Split((), (0,), "")))  # type: ignore[arg-type]

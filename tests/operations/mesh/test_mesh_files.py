@@ -13,7 +13,7 @@ import trimesh
 from analytic import MONO, MS, POL, RGB, AnalyticField, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.operations.mesh.extract import extract_mesh, write_mesh
+from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh, write_mesh
 from mmsynth.scene.scene import Region
 
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
@@ -22,7 +22,7 @@ TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 @pytest.fixture(scope="module")
 def mesh(tmp_path_factory: pytest.TempPathFactory) -> trimesh.Trimesh:
     field = AnalyticField(sphere(0.6), (RGB, MS, POL, MONO))
-    return extract_mesh(field, 24, scene=scene_of(field, tmp_path_factory.mktemp("scene"), truth=False))  # type: ignore[arg-type]
+    return extract_mesh(field, MeshOptions(24), scene=scene_of(field, tmp_path_factory.mktemp("scene"), truth=False))  # type: ignore[arg-type]
 
 
 def read_ply(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
@@ -129,7 +129,7 @@ def test_gltf_in_trimesh(mesh: trimesh.Trimesh, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])
 def test_geometry_comes_back(tmp_path: Path, suffix: str) -> None:
-    mesh = extract_mesh(AnalyticField(sphere(), [MONO]), 24)  # type: ignore[arg-type]
+    mesh = extract_mesh(AnalyticField(sphere(), [MONO]), MeshOptions(24))  # type: ignore[arg-type]
     write_mesh(mesh, tmp_path / f"mesh{suffix.upper()}")
     back = trimesh.load(tmp_path / f"mesh{suffix.upper()}", force="mesh")
     assert len(back.faces) == len(mesh.faces)
@@ -143,7 +143,7 @@ def test_far_from_the_origin_positions_are_double(tmp_path: Path) -> None:
     centre = (4.5e5, 5.1e6, 300.0)  # metres of a map
     field = AnalyticField(sphere(0.6, centre), [MONO], Region(centre, 1.0))
     field.unit = "map metre, ±1"
-    mesh = extract_mesh(field, 24)  # type: ignore[arg-type]
+    mesh = extract_mesh(field, MeshOptions(24))  # type: ignore[arg-type]
     write_mesh(mesh, tmp_path / "far.ply")
     comments, vertices, _ = read_ply(tmp_path / "far.ply")
     assert vertices.dtype["x"] == np.float64 and "unit map metre, ?1" in comments

@@ -1,9 +1,9 @@
 """What a mesh is, and how far it is from another.
 
-``describe``: counts, components, watertight, Euler number, boundary edges, area, volume (of a watertight mesh only), bounds; with the field
-also the residual |f| at the vertices and the middles of faces, in the scene's unit.
+``describe_mesh``: counts, components, watertight, Euler number, boundary edges, area, volume (of a watertight mesh only), bounds; with the
+field also the residual |f| at the vertices and the middles of faces, in the scene's unit.
 
-``compare``: a mesh against a reference in the same frame and unit, by points drawn evenly over both areas:
+``compare_meshes``: a mesh against a reference in the same frame and unit, by points drawn evenly over both areas:
 
 * ``accuracy``: mean distance of our points to the reference; ``completeness``: of the reference's points to ours; ``chamfer``: their mean.
   Distances are to triangles of the whole other mesh, not to points: to those whose middle, or a point on them, is among the nearest
@@ -24,21 +24,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
 from mmsynth.errors import InputError
-from mmsynth.operations.mesh.attributes import View, small
+from mmsynth.operations.mesh.attributes import View, coarse
 from mmsynth.operations.mesh.marching import Distance, checked
 from mmsynth.operations.mesh.topology import components, topology
 from mmsynth.operations.views.visibility import inside
-from mmsynth.sensors.camera import Camera, project
-
-if TYPE_CHECKING:
-    from mmsynth.scene.scene import Region
+from mmsynth.scene.scene import PosedCamera, Region
+from mmsynth.sensors.camera import project
 
 SAMPLES = 200_000
 _SPLAT = 200_000  # points that make the depth maps: several for each of their coarse pixels
@@ -46,7 +44,7 @@ _NEAREST = 8
 _SHARES = (0.005, 0.01, 0.02)  # of the region's radius: the distances of the F-score where none are given
 
 
-def describe(mesh: trimesh.Trimesh, sdf: Distance | None = None, cell: float | None = None) -> dict[str, Any]:
+def describe_mesh(mesh: trimesh.Trimesh, sdf: Distance | None = None, cell: float | None = None) -> dict[str, Any]:
     """Counts, topology and size, ready for JSON; residuals with ``sdf``, also in cells with ``cell`` (scene unit)."""
     faces = np.asarray(mesh.faces)
     found = topology(faces)
@@ -116,18 +114,19 @@ class _Samples:
         self.points, self.normals, self.face = self.points[rows], self.normals[rows], self.face[rows]
 
 
-def compare(
+def compare_meshes(
     mesh: trimesh.Trimesh,
     reference: trimesh.Trimesh,
+    *,
     region: Region | None = None,
-    views: Sequence[tuple[Camera, np.ndarray]] = (),
+    views: Sequence[PosedCamera] = (),
     distances: Sequence[float] | None = None,
     samples: int = SAMPLES,
 ) -> dict[str, Any]:
     """Score a mesh against a reference (definitions: module docstring), ready for JSON; the same unit throughout.
 
     Args:
-        region: only what is in its ball counts. views: camera and camera_to_world (4, 4); only what they see counts.
+        region: only what is in its ball counts. views: only what they see counts.
         distances: of the F-score; None: 0.5, 1 and 2 % of the radius of the region, or of half the reference's diagonal.
         samples: points on each mesh, before culling.
     Raises:
@@ -143,8 +142,8 @@ def compare(
         for drawn in (ours, true):
             drawn.keep(np.linalg.norm(drawn.points - np.array(region.centre), axis=1) <= region.radius)
     if views:
-        cameras = [(small(camera), pose) for camera, pose in views]
-        of_ours, of_true = (_depth_maps(m, cameras) for m in (mesh, reference))
+        coarse_views = [coarse(view) for view in views]
+        of_ours, of_true = (_depth_maps(m, coarse_views) for m in (mesh, reference))
         known = _known(of_ours, of_true, ours)
         seen = np.logical_or.reduce([view.sees(true.points, true.normals) > 0 for view in of_true])
         ours.keep(known)
@@ -199,18 +198,19 @@ class _Triangles:
         return best, cosine
 
 
-def _depth_maps(mesh: trimesh.Trimesh, cameras: Sequence[tuple[Camera, np.ndarray]]) -> list[View]:
+def _depth_maps(mesh: trimesh.Trimesh, views: Sequence[PosedCamera]) -> list[View]:
     """Of the points of a mesh, the nearest in each pixel."""
     points = _Samples(mesh, _SPLAT, 2).points
     out = []
-    for camera, pose in cameras:
+    for view in views:
+        camera, pose = view.camera, view.camera_to_world
         away = points - pose[:3, 3]
         pixels = project(away @ pose[:3, :3], camera)
         within = inside(pixels, camera)
         column, row = np.rint(pixels[within]).astype(np.int64).T
         depth = np.full((camera.height, camera.width), np.inf)
         np.minimum.at(depth, (row, column), np.linalg.norm(away[within], axis=1))
-        out.append(View(camera, pose, np.where(np.isfinite(depth), depth, np.nan)))
+        out.append(View(view, np.where(np.isfinite(depth), depth, np.nan)))
     return out
 
 
@@ -219,7 +219,8 @@ def _known(ours: Sequence[View], true: Sequence[View], points: _Samples) -> np.n
     seen, with_reference = np.zeros(len(points.points)), np.zeros(len(points.points))
     for view, other in zip(ours, true, strict=True):
         rows = np.flatnonzero(view.sees(points.points, points.normals) > 0)
-        pixels = np.rint(project((points.points[rows] - view.pose[:3, 3]) @ view.pose[:3, :3], view.camera)).astype(np.int64)
+        camera, pose = view.posed.camera, view.posed.camera_to_world
+        pixels = np.rint(project((points.points[rows] - pose[:3, 3]) @ pose[:3, :3], camera)).astype(np.int64)
         seen[rows] += 1
         with_reference[rows] += np.isfinite(other.depth_ray[pixels[:, 1], pixels[:, 0]])
     return (seen > 0) & (2 * with_reference >= seen)

@@ -1,0 +1,165 @@
+"""A fit from a scene to a run folder: the loop, its log, its checkpoints and the manifest."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mmsynth.field import kernels
+from mmsynth.field.field import Field
+from mmsynth.files import write_text
+from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
+from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.recipe import Recipe, load_recipe
+from mmsynth.fitting.schedule import sampling_at
+from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.scene.scene import Scene
+from mmsynth.scene.serialisation import CONVENTIONS
+from mmsynth.version import __version__
+
+CHECKPOINT_SECONDS = 60.0
+_BUDGET = 60.0  # seconds, of a fit that is given no length
+_LOG_SECONDS = 1.0
+
+
+def fit(
+    scene: Scene,
+    run: Path,
+    *,
+    recipe: Recipe | str | None = None,
+    steps: int | None = None,
+    budget: float | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = False,
+    on_start: Callable[[Needs], None] | None = None,
+    on_step: Callable[[FitProgress], None] | None = None,
+) -> Field:
+    """Learn the field of a scene and write it into a run folder.
+
+    Args:
+        recipe: or its name or file, see ``load_recipe``; None: the defaults.
+        steps: length in optimiser steps, or ``budget``: length in seconds of training; when both are None, what a resumed
+            checkpoint was planned for, else 60 s.
+        device: cpu or cuda. resume: go on from the run's checkpoint, if it has one.
+        on_start: called once with what the scene was found to need. on_step: called after every step.
+    Raises:
+        InputError: the scene or recipe cannot be read, the run folder cannot be written, or a checkpoint does not fit.
+        DivergedError: loss or gradients stopped to be finite; the checkpoint is kept.
+    """
+    saved = read_checkpoint(run) if resume else None
+    if steps is None and budget is None:
+        planned = saved["task"] if saved else {}
+        steps, budget = planned.get("steps") or None, planned.get("budget") or None
+        if steps is None and budget is None:
+            budget = _BUDGET
+    if device == "cpu":
+        kernels.announce_compilation()
+    trainer = Trainer(scene, recipe if isinstance(recipe, Recipe) else load_recipe(recipe), steps, budget, seed, device)
+    log: list[str] = []
+    if saved is not None:
+        trainer.restore(saved)
+        if (run / "train.jsonl").is_file():
+            log = [x for x in (run / "train.jsonl").read_text().splitlines() if json.loads(x)["step"] <= trainer.state.step]
+    else:
+        # an empty checkpoint first: a run folder that cannot be written is known now and not after an hour
+        write_checkpoint(run, trainer.checkpoint())
+    if on_start is not None:
+        on_start(trainer.needs)
+    began, before = time.perf_counter(), trainer.state.elapsed
+    last_saved = last_logged = began
+    while trainer.progress < 1.0:
+        try:
+            trainer.run_step()
+        except KeyboardInterrupt:
+            # the step may be half applied: only the last checkpoint is safe to go on from
+            print(f"interrupted; go on with --resume from the checkpoint in {run}", file=sys.stderr)
+            raise
+        now = time.perf_counter()
+        trainer.state.elapsed = before + now - began
+        if on_step is not None:
+            on_step(trainer.report())
+        if now - last_logged > _LOG_SECONDS or trainer.progress >= 1.0:
+            news = trainer.report()
+            log.append(json.dumps({"step": news.step, "elapsed": round(news.elapsed, 3), "loss": news.loss, "psnr": news.psnr}))
+            last_logged = now
+        if now - last_saved > CHECKPOINT_SECONDS:
+            _save(run, trainer, log)
+            last_saved = time.perf_counter()
+    _save(run, trainer, log)
+    field = _finished(trainer)
+    field.manifest = _manifest(trainer, scene)
+    field.save(run)
+    return field
+
+
+def _save(run: Path, trainer: Trainer, log: list[str]) -> None:
+    write_checkpoint(run, trainer.checkpoint())
+    write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
+
+
+def _finished(trainer: Trainer) -> Field:
+    """The field with the mean of its last parameters, the step of its renderings and the corrected poses."""
+    field = trainer.field
+    trainer.average.apply()
+    last = sampling_at(1.0, trainer.recipe, trainer.needs)
+    field.sampling = replace(last, step=last.step * trainer.recipe.rendered_step)
+    field.occupancy.update(
+        lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
+    )
+    field.corrections = trainer.refinement.corrections()
+    field.rig = {n: pose @ field.corrections.sensors.get(n, np.eye(4)) for n, pose in field.rig.items()}
+    return field
+
+
+def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
+    news = trainer.report()
+    return {
+        "mmsynth": __version__,
+        "scene": {
+            "path": str(scene.root.resolve()),
+            "format": scene.format,
+            "hash": trainer.task["scene"],
+            "test_views": list(scene.split.test),
+        },
+        "recipe": trainer.recipe.model_dump(),
+        "needs": trainer.needs.to_json(),
+        "exposure": trainer.gains(),
+        "poses": _poses(trainer, scene),
+        "seed": trainer.seed,
+        "steps": trainer.state.step,
+        "seconds": {"fit": news.elapsed},
+        "rays_per_s": news.rays_per_s,
+        "samples_per_s": news.samples_per_s,
+        "train_psnr": news.psnr,
+        "skipped_steps": trainer.state.bad_steps,
+        "grid_reopened": trainer.state.reopened,
+        "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
+        "threads": torch.get_num_threads(),
+        "cores": os.cpu_count(),
+        "device": str(trainer.device),
+        "conventions": CONVENTIONS,
+    }
+
+
+def _poses(trainer: Trainer, scene: Scene) -> dict[str, Any]:
+    """Corrected poses and by how much: each training view that was moved, with its frames, and each sensor with its place on the rig."""
+    field, sizes = trainer.field, trainer.refinement.sizes()
+    frames = {n: scene.frames_of(n, scene.split.train) for n in field.sensors}
+    return {
+        "views": {
+            v: size | {"camera_to_world": {n: field.pose_of(f).tolist() for n, fs in frames.items() for f in fs if str(f.view) == v}}
+            for v, size in sizes["views"].items()
+        },
+        "sensors": {n: size | {"sensor_to_reference": field.rig[n].tolist()} for n, size in sizes["sensors"].items()},
+    }
