@@ -65,7 +65,7 @@ def scene_of(task: Mapping[str, Any]) -> Scene:
     Raises:
         InputError: no such scene, modality or number of frames.
     """
-    return keep_frames(load_scene(Path(task["scene"]), task["modalities"]), task["frames"])
+    return keep_frames(load_scene(Path(task["scene"]), modalities=task["modalities"]), task["frames"])
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -> Iterator[dict[str, Any]]:

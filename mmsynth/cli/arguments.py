@@ -118,4 +118,4 @@ def load_run(run: Path | None, device: str = "cpu") -> tuple[Path, Any, Any]:
     from mmsynth.scene.load import load_scene
 
     path, field = load_field(run, device)
-    return path, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))
+    return path, field, load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors))

@@ -62,7 +62,7 @@ def fit(
     from mmsynth.scene.scene import keep_frames
 
     seconds = fit_length(steps, budget)
-    loaded = keep_frames(load_scene(scene_path(scene), modality_names(modalities)), frame_limits(frames))
+    loaded = keep_frames(load_scene(scene_path(scene), modalities=modality_names(modalities)), frame_limits(frames))
     name = loaded.root.resolve().name
     folder = run or (run_to_resume(name) if resume else new_run(name))
 

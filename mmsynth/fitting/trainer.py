@@ -25,6 +25,7 @@ from mmsynth.fitting.refinement import Refinement, see
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
 from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
 from mmsynth.scene.scene import Scene
+from mmsynth.sensors.metrics import psnr_from_mse
 
 PROBE_RAYS = 2048  # per modality
 _GAINS = "exposure.log_gain"
@@ -310,7 +311,7 @@ class Trainer:
     def report(self) -> FitProgress:
         """News for a progress bar."""
         s = self.state
-        psnr = {n: -10 * math.log10(max(e, 1e-12)) for n, e in self.mean_error.items()}
+        psnr = {n: psnr_from_mse(e) for n, e in self.mean_error.items()}
         rate = 1.0 / max(s.elapsed, 1e-9)
         return FitProgress(s.step, self.progress, s.elapsed, self.mean_loss, psnr, s.rays_total * rate, s.samples_total * rate)
 

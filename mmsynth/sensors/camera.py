@@ -19,7 +19,11 @@ from mmsynth.errors import InputError
 from mmsynth.sensors import lenses
 
 Lens = Literal["brown_conrady", "kannala_brandt"]
-COEFFICIENTS: dict[str, int] = {"brown_conrady": 8, "kannala_brandt": 4}
+COEFFICIENTS: dict[str, tuple[str, ...]] = {
+    "brown_conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "kannala_brandt": ("k1", "k2", "k3", "k4"),
+}
+"""Their names, in order."""
 _ON_AXIS = 1e-4  # tan θ below which a fisheye's r_d / r is taken from its series: the next term is 1e-16
 
 
@@ -66,7 +70,7 @@ class Camera:
     @property
     def coefficients(self) -> np.ndarray:
         """(8,) or, of a fisheye, (4,) distortion, zero-padded."""
-        return np.array(self.distortion + (0.0,) * (COEFFICIENTS[self.lens] - len(self.distortion)))
+        return np.array(self.distortion + (0.0,) * (len(COEFFICIENTS[self.lens]) - len(self.distortion)))
 
     @property
     def intrinsics(self) -> np.ndarray:

@@ -95,7 +95,7 @@ def run_batch(
 
 
 def _one(path: Path, out: Path, job: Job) -> dict[str, Any]:
-    scene = load_scene(path, job.modalities)
+    scene = load_scene(path, modalities=job.modalities)
     run = out / "run"
     field = _fitted(scene, run, job)
     made = None

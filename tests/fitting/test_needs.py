@@ -156,7 +156,7 @@ def test_a_modality_with_few_frames_is_scarce() -> None:
 def test_a_scarce_modality_leaves_geometry_and_appearance_alone() -> None:
     from mmsynth.packaged import data_folder
 
-    scene = keep_frames(load_scene(data_folder("example_scene"), ["rgb", "pol"]), {"rgb": 1})
+    scene = keep_frames(load_scene(data_folder("example_scene"), modalities=["rgb", "pol"]), {"rgb": 1})
     trainer = Trainer(scene, Recipe().with_changes({**SMALL, "loss.eikonal_weight": 0.0}), 10, None, 0, "cpu")
     assert trainer.needs.scarce == ("rgb",)
     weights = trainer.field.shader.heads.weight

@@ -36,7 +36,7 @@ def _recipe(**changes: object) -> Recipe:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(data_folder("example_scene"), ["rgb", "mono", "pol"])
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "mono", "pol"])
 
 
 def _disturbed(scene: Scene, views: float, sensors: float) -> Scene:
@@ -170,7 +170,12 @@ def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
     assert one.refinement.decided is not None and not one.refinement.decided["poses"]
     assert one.needs.evidence["poses"] == "off: there is one view"
     single = Trainer(
-        load_scene(data_folder("example_scene"), ["rgb"]), _recipe(**{"poses.rig": "on", "poses.views": "off"}), 10, None, 0, "cpu"
+        load_scene(data_folder("example_scene"), modalities=["rgb"]),
+        _recipe(**{"poses.rig": "on", "poses.views": "off"}),
+        10,
+        None,
+        0,
+        "cpu",
     )
     assert single.needs.evidence["rig"] == "off: no two sensors share views"
 

@@ -33,7 +33,7 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(data_folder("example_scene"), ["rgb", "nir"])
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "nir"])
 
 
 def _ball(radius: float, **sizes: Any) -> Field:

@@ -233,7 +233,7 @@ def test_a_checkpoint_of_another_fit_is_refused(scene: Scene, tmp_path: Path) ->
     with pytest.raises(InputError, match="recipe"):
         fit(scene, tmp_path, recipe=_recipe(**{"loss.eikonal_weight": 0.2}), steps=3, resume=True)
     with pytest.raises(InputError, match="scene"):
-        fit(load_scene(data_folder("example_scene"), ["rgb"]), tmp_path, recipe=SMALL, steps=3, resume=True)
+        fit(load_scene(data_folder("example_scene"), modalities=["rgb"]), tmp_path, recipe=SMALL, steps=3, resume=True)
     (tmp_path / "checkpoint" / "state.pt").write_bytes(b"broken")
     with pytest.raises(InputError, match="not a readable checkpoint"):
         fit(scene, tmp_path, recipe=SMALL, steps=3, resume=True)
@@ -478,7 +478,7 @@ def test_only_needed_parts_are_built(scene: Scene) -> None:
     forced = _trainer(scene, **{"surface.background": "on"})
     assert forced.field.design.background and "asked for by the recipe" in forced.needs.evidence["background"]
     assert forced.field.surface.grid.extent == forced.field.appearance.extent == forced.field.occupancy.extent == 2.0
-    rgb = load_scene(data_folder("example_scene"), ["rgb"])
+    rgb = load_scene(data_folder("example_scene"), modalities=["rgb"])
     assert _trainer(rgb).needs.evidence["tensor_head"].startswith("off")
 
 

@@ -44,9 +44,9 @@ def test_missing_and_unknown_folders(tmp_path: Path) -> None:
 
 def test_modalities_by_name_or_alias(write_mmsdata: Writer) -> None:
     root = write_mmsdata()
-    assert list(load_scene(root, ["infrared"]).sensors) == list(load_scene(root, ["NIR"]).sensors) == ["nir"]
+    assert list(load_scene(root, modalities=["infrared"]).sensors) == list(load_scene(root, modalities=["NIR"]).sensors) == ["nir"]
     with pytest.raises(InputError, match="no modality 'thermal' in this scene, expected one of rgb, nir"):
-        load_scene(root, ["rgb", "thermal"])
+        load_scene(root, modalities=["rgb", "thermal"])
 
 
 def test_broken_json_is_located(write_mmsdata: Writer) -> None:

@@ -54,7 +54,7 @@ from mmsynth.operations.views.flow import optical_flow
 from mmsynth.operations.views.trajectories import View
 from mmsynth.scene.images import write_png16
 from mmsynth.scene.layouts.mmsdata import meta_content
-from mmsynth.scene.poses import OPENGL_TO_OPENCV
+from mmsynth.scene.layouts.nerfstudio import transforms_content
 from mmsynth.scene.scene import PosedCamera, canonical_modality
 from mmsynth.scene.serialisation import CONVENTIONS, channels_to_json, posed_to_json
 from mmsynth.sensors.camera import Camera
@@ -348,9 +348,10 @@ def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
         views.append(where | {key: value for key, value in stated.items() if key != "request"})
     files = []
     for group in plan.groups if plan.format != "webdataset" else []:
-        poses = [cameras[group[0]] for cameras in plan.placed]
+        picture = f"{_of('image', group[0], plan.rig)}.png"
+        pictures = [PosedCamera(*cameras[group[0]], f"{view_folder(i)}/{picture}") for i, cameras in enumerate(plan.placed)]
         files.append(out / f"{_of('transforms', group[0], plan.rig)}.json")
-        write_json(files[-1], _transforms(poses, f"{_of('image', group[0], plan.rig)}.png"))
+        write_json(files[-1], transforms_content(pictures))
     if plan.format == "mms-data":
         files.append(out / "meta_data.json")
         write_json(files[-1], _meta(plan.field, out, list(plan.request["modalities"]), plan.placed))
@@ -367,26 +368,5 @@ def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
 def _meta(field: Field, out: Path, names: Sequence[str], placed: Sequence[Placed]) -> dict[str, Any]:
     """meta_data.json of a scene whose frames have all channels at every pixel."""
     sensors = [replace(field.sensors[name], mosaic=None) for name in names]
-    frames = {name: [(i, f"{i:04d}.tiff", *cameras[name]) for i, cameras in enumerate(placed)] for name in names}
+    frames = {name: {i: PosedCamera(*cameras[name], f"{i:04d}.tiff") for i, cameras in enumerate(placed)} for name in names}
     return meta_content(out, sensors, frames, field.region, field.unit)
-
-
-def _transforms(cameras: Sequence[tuple[Camera, np.ndarray]], picture: str) -> dict[str, Any]:
-    """nerfstudio's transforms.json: OpenGL axes, centre of the top-left pixel at (0.5, 0.5)."""
-    frames = []
-    for index, (camera, pose) in enumerate(cameras):
-        fisheye = camera.lens == "kannala_brandt"
-        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        frames.append({
-            "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-            "file_path": f"views/{index:04d}/{picture}",
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx + 0.5,
-            "cy": camera.cy + 0.5,
-            **dict(zip(names, map(float, camera.coefficients), strict=True)),
-            "transform_matrix": (np.asarray(pose) @ OPENGL_TO_OPENCV).tolist(),
-        })  # fmt: skip
-    return {"camera_model": frames[0]["camera_model"] if frames else "OPENCV", "frames": frames}

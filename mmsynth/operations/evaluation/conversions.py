@@ -8,7 +8,8 @@ training poses of the source (a colour matrix of the scene); ``nearest``, the ne
 the surface, and the field where that frame does not see it.
 
 Values are clipped to [0, 1]; PSNR, RMSE, SAM, Stokes and AoLP errors are over all pixels with a ray, ``psnr_region`` over those in the
-region of interest; ERGAS (of a ratio of 1) and SSIM are torchmetrics'. Without truth, raw photosites are compared: PSNR alone.
+region of interest; SSIM is that of ``evaluate``, over pixels with a ray; ERGAS (of a ratio of 1) is torchmetrics'. Without truth, raw
+photosites are compared: PSNR alone.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis, structural_similarity_index_measure
+from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis
 
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion.methods import METHODS, Converted, carried_through, chosen_method, convert_frame
-from mmsynth.operations.evaluation.evaluate import psnr_from_mse, spectral_angle_deg
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim_of_channels
 from mmsynth.sensors.mosaic import channels_of, photosites_of
 from mmsynth.sensors.polarization import (
     angle_of_linear_polarization,
@@ -192,9 +193,9 @@ def _errors(
     if kind == "raw":
         return out
     out["mse_channels"] = square[valid].reshape(-1, square.shape[-1])
-    both = [torch.from_numpy(np.where(valid[..., None], x, 0.0)).movedim(-1, 0)[None].float() for x in (seen, real)]
-    if min(valid.shape) >= 11:
-        out["ssim"] = np.array([float(structural_similarity_index_measure(both[0], both[1], data_range=1.0))])  # type: ignore[arg-type]
+    similar = ssim_of_channels(real, seen, valid)
+    if similar:
+        out["ssim"] = np.array([np.mean(similar)])
     if target.is_polarization:
         ours, true = (torch.from_numpy(x[valid]) for x in (values, light))
         out["stokes"] = ((ours - true) ** 2).numpy().ravel()
@@ -205,6 +206,7 @@ def _errors(
         out["physical"] = (ours[:, 1:].norm(dim=1) <= ours[:, 0] + 1e-6).double().numpy()
     elif target.channel_count > 1:
         out["sam"] = spectral_angle_deg(values[valid], light[valid])
+        both = [torch.from_numpy(np.where(valid[..., None], x, 0.0)).movedim(-1, 0)[None].float() for x in (seen, real)]
         out["ergas"] = np.array([float(error_relative_global_dimensionless_synthesis(both[0], both[1], ratio=1.0))])
     return out
 

@@ -410,7 +410,9 @@ def _write(
     for p in planned:
         own = [(camera, pose, name) for q, camera, pose, name in requests if q is p]
         frames += [(p, i, camera, pose) for i, (camera, pose, _) in zip(_ids([name for _, _, name in own]), own, strict=True)]
-    listing = {p.sensor.name: [(i, f"{i:04d}.{format}", camera, pose) for q, i, camera, pose in frames if q is p] for p in planned}
+    listing = {
+        p.sensor.name: {i: PosedCamera(camera, pose, f"{i:04d}.{format}") for q, i, camera, pose in frames if q is p} for p in planned
+    }
     content = meta_content(out, [p.sensor for p in planned], listing, field.region, field.unit)
     (out / "meta_data.json").unlink(missing_ok=True)  # it must not vouch for frames of another request
     for p in planned:

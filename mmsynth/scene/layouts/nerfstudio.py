@@ -1,12 +1,12 @@
-"""nerfstudio and instant-ngp scenes: ``transforms.json`` and image files.
+"""nerfstudio and instant-ngp: scenes (``transforms.json`` and image files), poses of ``transforms.json`` and ``camera_path.json``.
 
 * ``transform_matrix`` is camera-to-world in OpenGL axes; principal points have the top-left pixel's centre at 0.5.
 * The id of a view is the frame's ``view`` key, else its position in the list (frames without an image count too, so ids
   do not depend on what was downloaded).
 * Test views: ``test_filenames`` (or all but ``train_filenames``), else ``test_ids``, else every tenth.
 * One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
-  says which, and the optional top-level object ``modalities`` describes them with the keys of ``mmsdata.make_sensor``.
-* The region of interest is not in the file: see ``poses.region_from_cameras``, and ``region_from_points`` for files with the sparse
+  says which, and the optional top-level object ``modalities`` describes them with the keys of ``known_sensors.make_sensor``.
+* The region of interest is not in the file: see ``region.region_from_cameras``, and ``region_from_points`` for files with the sparse
   points of ``ply_file_path`` and for pictures with calibration boards.
 """
 
@@ -22,10 +22,26 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.capture.boards import board_points
+from mmsynth.scene.checks import make_camera, number, objects, rigid_pose, whole
 from mmsynth.scene.images import SUFFIXES, read_native
-from mmsynth.scene.layouts.mmsdata import make_sensor, wanted_modalities
-from mmsynth.scene.poses import OPENGL_TO_OPENCV, entries, region_from_cameras, region_from_points, rigid, transforms_camera, whole
-from mmsynth.scene.scene import Frame, Scene, Sensor, Split, canonical_modality, make_split
+from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.region import region_from_cameras, region_from_points
+from mmsynth.scene.scene import (
+    OPENGL_TO_OPENCV,
+    Frame,
+    PosedCamera,
+    Scene,
+    Sensor,
+    Split,
+    StatedPose,
+    canonical_modality,
+    make_split,
+)
+from mmsynth.sensors.camera import COEFFICIENTS, Camera, Lens
+
+_BROWN_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE_MODEL = "OPENCV_FISHEYE"
+_MODEL_OF: dict[str, str] = {"brown_conrady": "OPENCV", "kannala_brandt": _FISHEYE_MODEL}
 
 
 def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scene:
@@ -43,7 +59,7 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
     meta = read_json(path)
     if not isinstance(meta, dict):
         raise InputError(f"{path}: a JSON {type(meta).__name__}, expected an object with the key 'frames'.")
-    listed = entries(meta, "frames", path)
+    listed = objects(meta, "frames", path)
     images = [_image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)]
     present = [index for index, image in enumerate(images) if image is not None]
     if not present:
@@ -76,10 +92,10 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
         where = f"{path}: frame {index} ({frame['file_path']})"
         position = positions.get(source, 0)
         positions[source] = position + 1
-        pose = rigid(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
+        pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
         if found is None or names[source] not in wanted:
             continue
-        camera = transforms_camera(meta, frame, where, (first[source].shape[1], first[source].shape[0]))
+        camera = _camera(meta, frame, where, (first[source].shape[1], first[source].shape[0]))
         if camera is None:
             raise InputError(f"{where}: no focal length, expected 'fl_x' or 'camera_angle_x' in the frame or the file.")
         view = whole(frame, "view", where) if "view" in frame else position
@@ -171,3 +187,111 @@ def _names(meta: Mapping[str, Any], key: str, path: Path) -> set[str]:
 
 def _without_suffix(path: Path) -> Path:
     return path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
+
+
+def read_transforms(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
+    """The poses of ``transforms.json``, whose content is given; intrinsics where it has them."""
+    out: list[StatedPose] = []
+    for index, frame in enumerate(objects(content, "frames", path)):
+        where = f"{path}: frame {index}"
+        name = str(frame.get("file_path", f"{index:04d}"))
+        image = path.parent / name
+        size = None
+        if not {"w", "h"} <= {**content, **frame}.keys() and image.is_file():
+            height, width = read_native(image).shape[:2]
+            size = width, height
+        pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
+        out.append(StatedPose(_camera(content, frame, where, size), pose, Path(name).stem))
+    return out
+
+
+def read_camera_path(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
+    """The poses of ``camera_path.json``, whose content is given; square pixels, no distortion."""
+    kind = content.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise InputError(f"{path}: camera_type '{kind}' is not supported yet, expected 'perspective'.")
+    out: list[StatedPose] = []
+    for index, entry in enumerate(objects(content, "camera_path", path)):
+        where = f"{path}: camera {index}"
+        try:
+            matrix = np.asarray(entry.get("camera_to_world"), dtype=np.float64).reshape(4, 4)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{where}: key 'camera_to_world' does not hold 16 numbers.") from error
+        camera = None
+        if "render_width" in content and "render_height" in content and "fov" in entry:
+            width, height = whole(content, "render_width", str(path)), whole(content, "render_height", str(path))
+            fov = number(entry, "fov", where)
+            if not 0 < fov < 180:
+                raise InputError(f"{where}: key 'fov' is {fov}, expected between 0 and 180 degrees.")
+            focal = float(height / 2 / np.tan(np.radians(fov) / 2))
+            camera = make_camera(where, width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5, ())
+        out.append(StatedPose(camera, rigid_pose(matrix, where) @ OPENGL_TO_OPENCV, f"{index:04d}"))
+    return out
+
+
+def _camera(shared: Mapping[str, Any], frame: Mapping[str, Any], where: str, size: tuple[int, int] | None = None) -> Camera | None:
+    """Intrinsics of one frame of transforms.json; a key of the frame wins over the shared one.
+
+    Distortion k1..k6, p1, p2 is read as OpenCV's rational Brown model, k1..k4 of an ``OPENCV_FISHEYE`` (or ``is_fisheye``) as
+    Kannala-Brandt's. Keys that are missing: coefficients = 0, cx, cy = image centre, fl_y = fl_x, and fl_x, fl_y from
+    camera_angle_x, camera_angle_y [rad].
+
+    Args:
+        size: width, height of the image for files without w and h.
+    Returns:
+        None when there is neither a focal length nor an angle, or no size.
+    Raises:
+        InputError: bad number, or another lens model.
+    """
+    merged = {**shared, **frame}
+    model = str(merged.get("camera_model", "OPENCV")).upper()
+    fisheye = model == _FISHEYE_MODEL or (model in _BROWN_MODELS and bool(merged.get("is_fisheye")))
+    if model not in _BROWN_MODELS and not fisheye:
+        raise InputError(f"{where}: camera_model {model} is not supported, expected one of {' '.join((*_BROWN_MODELS, _FISHEYE_MODEL))}.")
+    if "w" in merged and "h" in merged:
+        size = whole(merged, "w", where), whole(merged, "h", where)
+    if size is None:
+        return None
+    width, height = size
+    # the innermost place that says anything about the focal length decides
+    source = frame if any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")) else shared
+    fx, fy = _focal(source, "x", width, where), _focal(source, "y", height, where)
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None:
+        return None
+    cx = number(merged, "cx", where) if "cx" in merged else width / 2
+    cy = number(merged, "cy", where) if "cy" in merged else height / 2
+    lens: Lens = "kannala_brandt" if fisheye else "brown_conrady"
+    distortion = [number(merged, key, where) if key in merged else 0.0 for key in COEFFICIENTS[lens]]
+    return make_camera(where, width, height, fx, fy, cx - 0.5, cy - 0.5, distortion, lens)
+
+
+def _focal(entry: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
+    if f"fl_{axis}" in entry:
+        return number(entry, f"fl_{axis}", where)
+    if f"camera_angle_{axis}" in entry:
+        angle = number(entry, f"camera_angle_{axis}", where)
+        if not 0 < angle < np.pi:
+            raise InputError(f"{where}: key 'camera_angle_{axis}' is {angle}, expected an angle between 0 and pi radians.")
+        return float(pixels / 2 / np.tan(angle / 2))
+    return None
+
+
+def transforms_content(views: Sequence[PosedCamera]) -> dict[str, Any]:
+    """What ``transforms.json`` says of pictures, whose ``file_path`` are the cameras' names: for ``write_json``."""
+    frames = [
+        {
+            "camera_model": _MODEL_OF[view.camera.lens],
+            "file_path": view.name,
+            "w": view.camera.width,
+            "h": view.camera.height,
+            "fl_x": view.camera.fx,
+            "fl_y": view.camera.fy,
+            "cx": view.camera.cx + 0.5,
+            "cy": view.camera.cy + 0.5,
+            **dict(zip(COEFFICIENTS[view.camera.lens], map(float, view.camera.coefficients), strict=True)),
+            "transform_matrix": (np.asarray(view.camera_to_world) @ OPENGL_TO_OPENCV).tolist(),
+        }
+        for view in views
+    ]
+    return {"camera_model": frames[0]["camera_model"] if frames else "OPENCV", "frames": frames}

@@ -18,7 +18,7 @@ from mmsynth.operations.views.coverage import training_rays
 from mmsynth.operations.views.flow import optical_flow
 from mmsynth.operations.views.trajectories import View
 from mmsynth.scene.images import read_image
-from mmsynth.scene.poses import read_poses
+from mmsynth.scene.load import read_poses
 
 
 def views_of(field: AnalyticField, count: int = 2) -> list[View]:
@@ -71,16 +71,16 @@ def test_native_rig(tmp_path: Path) -> None:
         assert np.array_equal(arrays["data"], truth.channels["pol"], equal_nan=True)
     with np.load(tmp_path / "views/0001/geometry_pol.npz") as arrays:
         assert np.array_equal(arrays["depth_z"], truth.depth_z, equal_nan=True)
-    assert np.allclose(read_poses(tmp_path / "transforms_pol.json")[1][1], pose)
+    assert np.allclose(read_poses(tmp_path / "transforms_pol.json")[1].camera_to_world, pose)
 
 
 def test_transforms_come_back(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     generate_dataset(field, views_of(field), tmp_path)  # type: ignore[arg-type]
-    for (camera, pose, _), (read_camera, read_pose, _) in zip(views_of(field), read_poses(tmp_path / "transforms.json"), strict=True):
-        assert read_camera is not None
-        assert np.allclose(read_pose, pose, atol=1e-12) and np.allclose(read_camera.matrix, camera.matrix)
-        assert np.allclose(read_camera.coefficients, camera.coefficients)
+    for (camera, pose, _), read in zip(views_of(field), read_poses(tmp_path / "transforms.json"), strict=True):
+        assert read.camera is not None
+        assert np.allclose(read.camera_to_world, pose, atol=1e-12) and np.allclose(read.camera.matrix, camera.matrix)
+        assert np.allclose(read.camera.coefficients, camera.coefficients)
 
 
 def test_resumes(tmp_path: Path) -> None:
