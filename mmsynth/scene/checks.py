@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -16,10 +16,18 @@ from mmsynth.errors import InputError
 from mmsynth.sensors.camera import Camera, Lens
 
 
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether it is a finite number that a float can hold."""
+    try:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer of more than 308 digits
+        return False
+
+
 def number(entry: Mapping[str, Any], key: str, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     """``entry[key]`` as a finite float; from ``low`` to ``high``."""
     value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value) or not low <= value <= high:
+    if not is_number(value) or not low <= value <= high:
         expected = "a finite number" if math.isinf(low) else f"a number from {low:g} to {high:g}"
         raise InputError(f"{where}: key '{key}' is {'missing' if key not in entry else repr(value)}, expected {expected}.")
     return float(value)
@@ -41,6 +49,22 @@ def objects(entry: Mapping[str, Any], key: str, where: str | Path) -> list[dict[
     return value
 
 
+def numbers(value: Any, otherwise: str) -> np.ndarray:
+    """Numbers, in lists or not, as a float64 array, which may hold NaN; ``otherwise``: what the error says."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(otherwise) from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is one; a name that no file can have (too long, NUL in it) has none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def rigid_pose(matrix: Any, where: str, tolerance: float = 1e-4) -> np.ndarray:
     """Check that a 3x4 or 4x4 matrix is a rigid motion, and remove its rounding errors.
 
@@ -54,10 +78,7 @@ def rigid_pose(matrix: Any, where: str, tolerance: float = 1e-4) -> np.ndarray:
     """
     if matrix is None:
         raise InputError(f"{where}: the camera-to-world matrix is missing, expected 4x4 or 3x4.")
-    try:
-        pose = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: the pose is not a matrix of numbers, expected 4x4 or 3x4.") from error
+    pose = numbers(matrix, f"{where}: the pose is not a matrix of numbers, expected 4x4 or 3x4.")
     if pose.shape not in ((3, 4), (4, 4)):
         raise InputError(f"{where}: the pose has the shape {pose.shape}, expected 4x4 or 3x4.")
     if not np.isfinite(pose).all():

@@ -22,6 +22,7 @@ from mmsynth.sensors.camera import Camera
 
 Layout = Literal["MMS-DATA", "nerfstudio", "Middlebury"]
 
+MAX_VIEW = 999_999_999  # ids of views are whole numbers from 0
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """camera_to_world in OpenGL axes (y up, z back) times this = in OpenCV axes."""
 

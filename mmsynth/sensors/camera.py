@@ -24,6 +24,7 @@ COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "kannala_brandt": ("k1", "k2", "k3", "k4"),
 }
 """Their names, in order."""
+MAX_SIZE = 1_000_000  # pixels: ten times the largest panoramas
 _ON_AXIS = 1e-4  # tan θ below which a fisheye's r_d / r is taken from its series: the next term is 1e-16
 
 
@@ -54,8 +55,8 @@ class Camera:
             raise InputError(
                 f"distortion: {len(self.distortion)} coefficients, expected 0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6."
             )
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"camera: size {self.width}x{self.height}, expected at least 1x1 pixel.")
+        if not (1 <= self.width <= MAX_SIZE and 1 <= self.height <= MAX_SIZE):
+            raise InputError(f"camera: size {self.width}x{self.height}, expected at least 1x1 pixel, at most {MAX_SIZE} a side.")
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
             raise InputError(

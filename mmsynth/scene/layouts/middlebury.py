@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.scene.checks import make_camera, rigid_pose, text_lines
+from mmsynth.scene.checks import is_file, make_camera, rigid_pose, text_lines
 from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.region import region_from_cameras
@@ -41,7 +41,7 @@ def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scen
     for view, (row, tokens) in enumerate(lines):
         where = f"{path}: line {row}"
         matrix, pose = _parse(tokens, where)
-        if (root / tokens[0]).is_file():
+        if is_file(root / tokens[0]):
             found.append((view, root / tokens[0], matrix, pose))
         else:
             missing += 1

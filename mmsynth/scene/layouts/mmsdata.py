@@ -26,10 +26,11 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
-from mmsynth.scene.checks import number, objects, rigid_pose, whole
+from mmsynth.scene.checks import is_file, is_number, number, numbers, objects, rigid_pose, whole
 from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import KNOWN, make_sensor, wanted_modalities
 from mmsynth.scene.scene import (
+    MAX_VIEW,
     OPENGL_TO_OPENCV,
     Frame,
     PosedCamera,
@@ -197,10 +198,7 @@ def _world_to_output(meta: Mapping[str, Any], path: Path) -> tuple[np.ndarray, f
     if meta.get("worldtogt") is None:
         return np.eye(4), 1.0, "input unit"
     where = f"{path}: key 'worldtogt'"
-    try:
-        matrix = np.asarray(meta["worldtogt"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where} is not a matrix of numbers, expected 4x4.") from error
+    matrix = numbers(meta["worldtogt"], f"{where} is not a matrix of numbers, expected 4x4.")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{where} is not a finite 4x4 matrix, expected a similarity (rotation, one scale, translation).")
     scale = float(np.sqrt((matrix[:3, :3] ** 2).sum() / 3))  # of a similarity: every row has the length s
@@ -221,7 +219,7 @@ def _camera(entry: Mapping[str, Any], where: str, undistorted: bool, offset: flo
     distortion: tuple[float, ...] = ()
     if not undistorted and model not in _PINHOLE_MODELS:
         given = entry.get("distortion_params")
-        if not isinstance(given, list) or len(given) != 6 or not all(isinstance(value, (int, float)) for value in given):
+        if not isinstance(given, list) or len(given) != 6 or not all(is_number(value) for value in given):
             raise InputError(f"{where}: key 'distortion_params' is {given}, expected the six numbers k1 k2 p1 p2 k3 k4.")
         distortion = tuple(float(value) for value in given) if any(given) else ()
     try:
@@ -246,7 +244,7 @@ def _frames(
     missing = 0
     for view, file_name, pose in _stated_frames(entry, where, to_output, scale):
         path = root / "modalities" / source / file_name
-        if not path.is_file():
+        if not is_file(path):
             missing += 1
             continue
         mask = root / "masks" / source / f"{view:04d}.png"
@@ -258,7 +256,7 @@ def _stated_frames(entry: Mapping[str, Any], where: str, to_output: np.ndarray, 
     """View id, file name and camera_to_world (4, 4) of what a modality lists, in its order; poses in the frame of the Scene."""
     seen: set[int] = set()
     for index, item in enumerate(objects(entry, "frames", where)):
-        view = whole(item, "frame_id", f"{where}, frame entry {index}")
+        view = whole(item, "frame_id", f"{where}, frame entry {index}", 0, MAX_VIEW)
         here = f"{where}, frame {view}"
         if view in seen:
             raise InputError(f"{here} is listed twice, expected every frame_id once.")

@@ -22,11 +22,12 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.capture.boards import board_points
-from mmsynth.scene.checks import make_camera, number, objects, rigid_pose, whole
+from mmsynth.scene.checks import is_file, make_camera, number, numbers, objects, rigid_pose, whole
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.region import region_from_cameras, region_from_points
 from mmsynth.scene.scene import (
+    MAX_VIEW,
     OPENGL_TO_OPENCV,
     Frame,
     PosedCamera,
@@ -98,9 +99,9 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
         camera = _camera(meta, frame, where, (first[source].shape[1], first[source].shape[0]))
         if camera is None:
             raise InputError(f"{where}: no focal length, expected 'fl_x' or 'camera_angle_x' in the frame or the file.")
-        view = whole(frame, "view", where) if "view" in frame else position
+        view = whole(frame, "view", where, 0, MAX_VIEW) if "view" in frame else position
         mask = root / str(frame["mask_path"]) if "mask_path" in frame else None
-        frames.append(Frame(names[source], view, found, camera, pose, source, mask if mask is not None and mask.is_file() else None))
+        frames.append(Frame(names[source], view, found, camera, pose, source, mask if mask is not None and is_file(mask) else None))
     order = list(sensors)
     frames.sort(key=lambda frame: (order.index(frame.sensor), frame.view))
     for one, two in itertools.pairwise(frames):
@@ -141,7 +142,7 @@ def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None
     path = root / frame["file_path"]
     # appended, not replaced: "0001.rgb" is a name without extension
     candidates = [path] if path.suffix.lower() in SUFFIXES else [path.with_name(path.name + suffix) for suffix in SUFFIXES]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
 def _known(path: Path | None) -> Path:
@@ -197,7 +198,7 @@ def read_transforms(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
         name = str(frame.get("file_path", f"{index:04d}"))
         image = path.parent / name
         size = None
-        if not {"w", "h"} <= {**content, **frame}.keys() and image.is_file():
+        if not {"w", "h"} <= {**content, **frame}.keys() and is_file(image):
             height, width = read_native(image).shape[:2]
             size = width, height
         pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
@@ -213,10 +214,10 @@ def read_camera_path(content: Mapping[str, Any], path: Path) -> list[StatedPose]
     out: list[StatedPose] = []
     for index, entry in enumerate(objects(content, "camera_path", path)):
         where = f"{path}: camera {index}"
-        try:
-            matrix = np.asarray(entry.get("camera_to_world"), dtype=np.float64).reshape(4, 4)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{where}: key 'camera_to_world' does not hold 16 numbers.") from error
+        complaint = f"{where}: key 'camera_to_world' does not hold 16 numbers."
+        matrix = numbers(entry.get("camera_to_world"), complaint)
+        if matrix.size != 16:
+            raise InputError(complaint)
         camera = None
         if "render_width" in content and "render_height" in content and "fov" in entry:
             width, height = whole(content, "render_width", str(path)), whole(content, "render_height", str(path))
@@ -225,7 +226,7 @@ def read_camera_path(content: Mapping[str, Any], path: Path) -> list[StatedPose]
                 raise InputError(f"{where}: key 'fov' is {fov}, expected between 0 and 180 degrees.")
             focal = float(height / 2 / np.tan(np.radians(fov) / 2))
             camera = make_camera(where, width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5, ())
-        out.append(StatedPose(camera, rigid_pose(matrix, where) @ OPENGL_TO_OPENCV, f"{index:04d}"))
+        out.append(StatedPose(camera, rigid_pose(matrix.reshape(4, 4), where) @ OPENGL_TO_OPENCV, f"{index:04d}"))
     return out
 
 
