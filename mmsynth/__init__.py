@@ -6,14 +6,9 @@ The names below are loaded when first used, so that ``mmsynth --help`` does not 
 from __future__ import annotations
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
 from mmsynth.version import __version__ as __version__
-
-# OpenMP's threads spin for milliseconds at every barrier by default, which stalls a fit beside another busy process.
-# A short spin costs nothing alone and was 1.6 times as fast beside one. Read when torch is loaded; a user's own setting stays.
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 if TYPE_CHECKING:
     from mmsynth.errors import DivergedError, InputError

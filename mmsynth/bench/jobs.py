@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-import mmsynth
 from mmsynth.bench.machine import identify
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.files import read_json, write_json
@@ -29,7 +28,7 @@ from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene, keep_frames
 
-_PACKAGE = Path(mmsynth.__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 # what a fit and its score run through
 _CODE = ("field", "fitting", "scene", "sensors", "operations/evaluation", "bench/worker.py")
 

@@ -18,7 +18,6 @@ from mmsynth.cli.arguments import (
     SceneArgument,
     fit_length,
     frame_limits,
-    load_run,
     modality_names,
     modality_pairs,
     scene_path,
@@ -54,22 +53,15 @@ def fit(
     """Learn the field of a scene."""
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
-    from mmsynth.fitting.run import fit as fit_field
-    from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
     from mmsynth.fitting.trainer import FitProgress
-    from mmsynth.report.report import write_run_report
+    from mmsynth.report.text import fit_text
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
+    from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
     loaded = keep_frames(load_scene(scene_path(scene), modalities=modality_names(modalities)), frame_limits(frames))
-    name = loaded.root.resolve().name
-    folder = run or (run_to_resume(name) if resume else new_run(name))
-
-    def say(text: str) -> None:
-        if not as_json:
-            print(text)
-
+    say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")
     with progress_bar("fit", as_json) as show:
@@ -89,29 +81,12 @@ def fit(
         def on_start(needs: Needs) -> None:
             explain(needs.evidence)
 
-        field = fit_field(
-            loaded,
-            folder,
-            recipe=recipe,
-            steps=steps,
-            budget=seconds,
-            seed=seed,
-            device=pick_device(device),
-            resume=resume,
-            on_start=on_start,
-            on_step=on_step,
-        )
-        explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
-    write_run_report(folder, field, scene=loaded)
-    mark_latest(folder)
-    facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
-    if as_json:
-        print(json.dumps(facts))
-        return
-    shown = ", ".join(f"{n} {v:.1f}" for n, v in facts["train_psnr"].items())
-    print(f"{facts['steps']} steps in {facts['seconds']['fit']:.0f} s, {facts['rays_per_s']:,.0f} rays/s")
-    print(f"PSNR on training pixels [dB]: {shown}")
-    print(f"wrote {folder}/ (field.safetensors, manifest.json, preview.png, report.html)")
+        fitted = fit_run(
+            loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
+            on_start=on_start, on_step=on_step,
+        )  # fmt: skip
+        explain(fitted.field.manifest["needs"]["evidence"])  # with what residuals decided on the way
+    print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
 
 
 @command("evaluate")
@@ -123,26 +98,20 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Score the test views."""
-    from mmsynth.operations.evaluation.evaluate import evaluate as score
-    from mmsynth.report.report import write_run_report
+    from mmsynth.operations.evaluation.conversions import evaluate_conversions
     from mmsynth.report.text import conversion_text, score_text
+    from mmsynth.workflows.fit import evaluate_run
+    from mmsynth.workflows.runs import open_run
 
-    folder, field, scene = load_run(run)
-    if convert is not None:
-        from mmsynth.operations.evaluation.conversions import evaluate_conversion
-
-        pairs = modality_pairs(convert, list(field.sensors))
-        found = []
-        with progress_bar("evaluate", as_json) as show:
-            for done, (a, b) in enumerate(pairs):
-                found.append(evaluate_conversion(field, scene, a, b))
-                show(done + 1, len(pairs))
-        print(json.dumps({"conversions": found}) if as_json else conversion_text(found))
-        return
+    opened = open_run(run)
     with progress_bar("evaluate", as_json) as show:
-        scores = score(field, scene, progress=show)
-    write_run_report(folder, field, scores, scene=scene)
-    print(json.dumps(scores) if as_json else score_text(scores))
+        if convert is None:
+            scores = evaluate_run(opened, progress=show)
+            print(json.dumps(scores) if as_json else score_text(scores))
+        else:
+            pairs = modality_pairs(convert, list(opened.field.sensors))
+            conversions = evaluate_conversions(opened.field, opened.scene, pairs, progress=show)
+            print(json.dumps({"conversions": conversions}) if as_json else conversion_text(conversions))
 
 
 @command("batch")

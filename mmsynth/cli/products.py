@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, load_field, load_run, modality_names, poses_file, view_ids
+from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, modality_names, poses_file, view_ids
 from mmsynth.cli.terminal import command, print_written, progress_bar
 from mmsynth.errors import InputError
 
@@ -37,8 +37,10 @@ def convert(
     from mmsynth.operations.conversion.files import convert_at_poses, convert_frames, convert_images
     from mmsynth.operations.views.trajectories import load_views
     from mmsynth.scene.scene import canonical_modality
+    from mmsynth.workflows.runs import open_run
 
-    folder, field, scene = load_run(run)
+    opened = open_run(run)
+    folder, field, scene = opened.folder, opened.field, opened.scene
     a, b = canonical_modality(source), canonical_modality(target)
     if views is not None and (images or poses):
         raise InputError("--views: frames of the scene are converted with it, expected it without --images and --poses.")
@@ -95,11 +97,13 @@ def generate_dataset(
     from mmsynth.operations.output.work_partition import local_device, share_of_environment
     from mmsynth.operations.views.coverage import covered_views, training_rays, view_scores
     from mmsynth.operations.views.trajectories import load_views
+    from mmsynth.workflows.runs import open_run
 
     if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
         raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
     share = share_of_environment()
-    folder, field, scene = load_run(run, local_device(pick_device(device)))
+    opened = open_run(run, device=local_device(pick_device(device)))
+    folder, field, scene = opened.folder, opened.field, opened.scene
     destination = out or folder / "dataset"
     if verify:
         problems = dataset_index.verify(destination)
@@ -158,11 +162,13 @@ def simulate(
     from mmsynth.operations.output.work_partition import share_of_environment
     from mmsynth.operations.simulation import simulate as twins
     from mmsynth.operations.views.trajectories import load_views
+    from mmsynth.workflows.runs import open_run
 
     if (poses is None) == (views is None):
         raise InputError("simulate: give one of --poses and --views.")
     share = share_of_environment()
-    folder, field, scene = load_run(run)
+    opened = open_run(run)
+    folder, field, scene = opened.folder, opened.field, opened.scene
     destination = out or folder / "simulated"
     with progress_bar("simulate", as_json) as show:
         if poses is not None:
@@ -204,6 +210,7 @@ def calibrate_noise(
     from mmsynth.operations.simulation import calibrate_noise as noise
     from mmsynth.report.text import noise_text
     from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
+    from mmsynth.workflows.runs import open_run
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
     untold: dict[str, str] = {}
@@ -212,7 +219,8 @@ def calibrate_noise(
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
         found, destination = {files[0].name: noise.calibrate_from_frames(files[0], frames)}, out or Path("sensors")
     else:
-        folder, field, scene = load_run(run)
+        opened = open_run(run)
+        folder, field, scene = opened.folder, opened.field, opened.scene
         known = noise.by_modality(files)
         with progress_bar("noise", as_json) as show:
             found, untold = noise.calibrate_noise(field, scene, modality_names(modalities), known, raw, view_ids(views), progress=show)
@@ -245,11 +253,13 @@ def mesh(
     """The surface with every modality on it, in the input's frame and unit."""
     from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
     from mmsynth.report.text import mesh_text
+    from mmsynth.workflows.runs import open_field, open_run
 
     if geometry_only and not min_views and against is None:
-        (folder, field), scene = load_field(run), None  # the scene may be elsewhere
+        (folder, field), scene = open_field(run), None  # the scene may be elsewhere
     else:
-        folder, field, scene = load_run(run)
+        opened = open_run(run)
+        folder, field, scene = opened.folder, opened.field, opened.scene
     destination, at = out or folder / "mesh.ply", lengths(distances)
     options = MeshOptions(
         resolution, keep=keep_of(keep), closed=closed, attributes=not geometry_only, min_views=min_views, faces=faces, max_error=max_error

@@ -364,3 +364,8 @@ def test_a_full_disk_leaves_nothing_half_written(fitted: Path, tmp_path: Path) -
         refused(run(fitted, *args, largest_file=20_000), "could not be written")
     assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.suffix != ".json" and p.stat().st_size == 20_000]
     assert not list(tmp_path.rglob("*tmp*"))
+
+
+def test_importing_sets_no_environment_variable() -> None:
+    code = "import os, cv2, torch; before = dict(os.environ); import mmsynth; mmsynth.load_scene; assert dict(os.environ) == before"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

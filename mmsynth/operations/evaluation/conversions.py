@@ -45,6 +45,18 @@ if TYPE_CHECKING:
 _LEARNED_FROM = 8  # renderings for the linear map
 
 
+def evaluate_conversions(
+    field: Field, scene: Scene, pairs: Sequence[tuple[str, str]], *, progress: Progress | None = None
+) -> list[dict[str, Any]]:
+    """``evaluate_conversion`` of pairs of source and target; progress: called with (pairs done, pairs in all)."""
+    out = []
+    for done, (source, target) in enumerate(pairs, 1):
+        out.append(evaluate_conversion(field, scene, source, target))
+        if progress is not None:
+            progress(done, len(pairs))
+    return out
+
+
 def evaluate_conversion(
     field: Field, scene: Scene, source: str, target: str, views: Sequence[int] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
