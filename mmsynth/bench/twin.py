@@ -24,6 +24,7 @@ from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_table
 from mmsynth.bench.output import Report, scatter_panels, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.operations.output.progress import Progress
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera, resized
 from mmsynth.sensors.noise import NoiseModel, record
 from mmsynth.sensors.photon_transfer import photon_transfer, photon_transfer_of_frames
@@ -156,7 +157,8 @@ def _star(camera: Camera) -> Tensor:
 
 def of_the_field(field: Field) -> list[Method]:
     """The first sensor of a fitted field, rays per pixel along each axis, against 8 x 8."""
-    from mmsynth.operations.simulation.simulate import Simulated, render_light
+    from mmsynth.operations.simulation.frames import render_light
+    from mmsynth.operations.simulation.plan import SimulatedSensor
 
     name = next(iter(field.sensors))
     camera = field.cameras[name]
@@ -166,8 +168,9 @@ def of_the_field(field: Field) -> list[Method]:
     file = SensorFile.model_validate({"name": name, "instance_of": name, "noise": _PLAIN})
 
     def light(s: int) -> Tensor:
-        planned = Simulated(file, field.sensors[name], camera, np.eye(4), (name,), s, False, lambda c, _: np.moveaxis(c[name], -1, 0), {})
-        return render_light(field, planned, camera, pose)
+        own_light = lambda c, _: np.moveaxis(c[name], -1, 0)
+        planned = SimulatedSensor(file, field.sensors[name], camera, np.eye(4), (name,), s, False, own_light, {})
+        return render_light(field, planned, PosedCamera(camera, pose))
 
     truth = light(8)
 
