@@ -58,9 +58,9 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     footprint = _footprint(measurements) * coarser
     outside, bright, light, rays = _look_outside(measurements, np.random.default_rng((seed, 7)))
     evidence = {}
-    if recipe.background != "auto":
-        background = recipe.background == "on"
-        evidence["background"] = f"{recipe.background}: asked for by the recipe"
+    if recipe.surface.background != "auto":
+        background = recipe.surface.background == "on"
+        evidence["background"] = f"{recipe.surface.background}: asked for by the recipe"
     elif scene.black_background or any(m.has_alpha for m in measurements.values()):
         background = False
         evidence["background"] = "off: the input says that it is black or transparent"
@@ -76,10 +76,10 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     dim = "nothing is seen past the region of interest" if outside < 0.005 else f"what is past it has {light:.1%} of the brightest light"
     if background:
         beyond, evidence["beyond"] = False, "off: the background is modelled"
-    elif recipe.decide_at >= 1.0:
+    elif recipe.schedule.decide_at >= 1.0:
         beyond, evidence["beyond"] = False, "off: it is learned once residuals have decided, which the recipe leaves out (decide_at = 1)"
-    elif recipe.beyond != "auto":
-        beyond, evidence["beyond"] = recipe.beyond == "on", f"{recipe.beyond}: asked for by the recipe"
+    elif recipe.radiance.far_light != "auto":
+        beyond, evidence["beyond"] = recipe.radiance.far_light == "on", f"{recipe.radiance.far_light}: asked for by the recipe"
     elif scene.black_background or any(m.has_alpha for m in measurements.values()):
         beyond, evidence["beyond"] = False, "off: the input says that it is black or transparent"
     else:
@@ -87,53 +87,53 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         evidence["beyond"] = f"{'on' if beyond else 'off'}: {dim}"
     # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
     extent = 2 if background else 1  # contracted space is twice as wide
-    finest = extent * recipe.surface_cells / footprint
+    finest = 2 * extent * recipe.surface.cells_per_pixel / footprint
     # geometry that few measurements see bends to each of them; appearance may, it is only looked at from where they were taken
-    seen_enough = max(_COARSE, math.sqrt(min(pixels, rays_to_come) / (_FACES * recipe.measurements_per_cell)))
+    seen_enough = max(_COARSE, math.sqrt(min(pixels, rays_to_come) / (_FACES * recipe.surface.measurements_per_cell)))
     surface_finest = int(np.clip(min(finest, seen_enough), 32, 1024))
-    radiance_finest = int(np.clip(extent * recipe.radiance_cells / footprint, 64, 2048))
+    radiance_finest = int(np.clip(2 * extent * recipe.radiance.cells_per_pixel / footprint, 64, 2048))
     cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
     seen = f", {coarser:.1f} pixels apart for {rays_to_come:.1e} rays on {pixels:.1e} pixels" if coarser > 1 else ""
-    few = f", the surface's for {recipe.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
+    few = f", the surface's for {recipe.surface.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
     evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}{few}"
-    radius = recipe.initial_radius or (0.4 if background else 0.5)
+    radius = recipe.surface.initial_radius or (0.4 if background else 0.5)
     farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in measurements.values())
     # measured: what starts far behind the scene reaches it late, and in streaks
-    horizon = recipe.horizon or 2.0 - 1.0 / (_HORIZON * max(farthest, 1.0))
+    horizon = recipe.surface.outer_radius or 2.0 - 1.0 / (_HORIZON * max(farthest, 1.0))
     around = f", one around everything at {1 / (2 - horizon):.2g} radii" if background else ""
-    why = "asked for by the recipe" if recipe.initial_radius else f"background {'on' if background else 'off'}"
+    why = "asked for by the recipe" if recipe.surface.initial_radius else f"background {'on' if background else 'off'}"
     evidence["initial_sphere"] = f"radius {radius:g}: {why}{around}"
-    share = _shares(measurements, recipe.scarce_below)
+    share = _shares(measurements, recipe.sampling.sparse_below)
     scarce = tuple(n for n, s in share.items() if s < 1.0)
     frames = ", ".join(f"{n} {len(measurements[n].origins)} frames" for n in scarce)
     evidence["scarce"] = f"on: {frames}: learned from the geometry of the others" if scarce else "off: all modalities have enough pixels"
     pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
     evidence["tensor_head"] = f"on: {', '.join(pol)}; costs six outputs each" if pol else "off: no polarization sensor"
-    surface_rows, radiance_rows = recipe.surface_rows_log2, recipe.radiance_rows_log2
-    if recipe.tables_at == 0:
+    surface_rows, radiance_rows = recipe.surface.max_rows_log2, recipe.radiance.max_rows_log2
+    if recipe.schedule.tables_at == 0:
         evidence["tables"] = f"2^{surface_rows} and 2^{radiance_rows} rows a level: asked for by the recipe"
     else:
         # a row that few rays meet is noise, and costs as much as any other
-        surface_rows = rows_log2(rays_to_come / (2.0 * recipe.rays_per_row), surface_rows)
-        radiance_rows = rows_log2(rays_to_come / recipe.rays_per_row, radiance_rows)
+        surface_rows = rows_log2(rays_to_come / recipe.surface.rays_per_row, surface_rows)
+        radiance_rows = rows_log2(rays_to_come / recipe.radiance.rays_per_row, radiance_rows)
     design = Design(
-        surface_levels=recipe.surface_levels,
+        surface_levels=recipe.surface.levels,
         surface_rows_log2=surface_rows,
         surface_finest=surface_finest,
-        radiance_levels=recipe.radiance_levels,
+        radiance_levels=recipe.radiance.levels,
         radiance_rows_log2=radiance_rows,
         radiance_finest=radiance_finest,
         background=background,
         far_light=beyond,
         outer_radius=horizon,
-        surface_hidden=recipe.surface_hidden,
-        radiance_hidden=recipe.radiance_hidden,
-        occupancy=recipe.occupancy_resolution,
+        surface_hidden=recipe.surface.hidden_width,
+        radiance_hidden=recipe.radiance.hidden_width,
+        occupancy=recipe.sampling.occupancy_resolution,
         initial_radius=radius,
     )
     black = not background and outside >= 0.005
-    sharpness = recipe.sharpness_end * min(1.0, seen_enough / finest) / footprint
-    return Needs(design, footprint, max(sharpness, 2 * recipe.sharpness_start), black, scarce, share, evidence)
+    sharpness = recipe.schedule.sharpness_per_footprint * min(1.0, seen_enough / finest) / footprint
+    return Needs(design, footprint, max(sharpness, 2 * recipe.schedule.sharpness_start), black, scarce, share, evidence)
 
 
 def _shares(measurements: dict[str, Measurements], below: float) -> dict[str, float]:

@@ -64,10 +64,10 @@ class Refinement:
         self.motions = Motions(np.zeros((len(self.layout.views), 6)), np.zeros((len(self.layout.sensors), 6)))
         self.decided: dict[str, bool] | None = None
         self.evidence: dict[str, str] = {}
-        self.steps, self.next = 0, recipe.poses_at
+        self.steps, self.next = 0, recipe.poses.start_at
         self.possible = {
-            "poses": recipe.poses != "off" and len(self.layout.views) > 1,
-            "rig": recipe.rig != "off" and int(self.layout.free.sum()) > 1,
+            "poses": recipe.poses.views != "off" and len(self.layout.views) > 1,
+            "rig": recipe.poses.rig != "off" and int(self.layout.free.sum()) > 1,
         }
         if not any(self.possible.values()):
             self._settle({}, {})
@@ -103,7 +103,7 @@ class Refinement:
 
     def _decide(self, said: Equations) -> None:
         """By the share of the error of rays not learned from that motions of views save beyond those of sensors, and the reverse."""
-        can, worth = self.possible, self.recipe.poses_worth
+        can, worth = self.possible, self.recipe.poses.min_improvement
         views, rig, both = (
             poses.confirmed(said, self.layout, self.motions, v, r, self.prior)[1] if v or r else 0.0
             for v, r in ((can["poses"], False), (False, can["rig"]), (can["poses"], can["rig"]))
@@ -117,7 +117,7 @@ class Refinement:
     def _settle(self, wanted: dict[str, bool], why: dict[str, str]) -> None:
         self.decided = {}
         cannot = {"poses": "there is one view", "rig": "no two sensors share views"}
-        for what, asked in (("poses", self.recipe.poses), ("rig", self.recipe.rig)):
+        for what, asked in (("poses", self.recipe.poses.views), ("rig", self.recipe.poses.rig)):
             on = self.possible[what] and (asked == "on" or wanted[what])
             self.decided[what] = on
             reason = why[what] if self.possible[what] else cannot[what]

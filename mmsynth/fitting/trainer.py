@@ -83,13 +83,13 @@ class Trainer:
         self.log_gain = torch.nn.Parameter(torch.zeros(frames, device=self.device))
         parameters = {**dict(self.field.named_parameters()), _GAINS: self.log_gain}
         tables = {n for n in parameters if n.endswith(".table")}
-        rates = {n: recipe.learning_rate_grid if n in tables else recipe.learning_rate_network for n in parameters}
-        rates[_GAINS] = recipe.learning_rate_exposure
+        rates = {n: recipe.schedule.learning_rate_grid if n in tables else recipe.schedule.learning_rate_network for n in parameters}
+        rates[_GAINS] = recipe.schedule.learning_rate_exposure
         self.optimiser = Adam(parameters, rates)
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
-        self.state = _State(rays=recipe.rays_at_start)
+        self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe, self.needs.footprint, seed)
         self.needs.evidence.update(self.refinement.evidence)
@@ -106,7 +106,7 @@ class Trainer:
 
     def _rays_to_come(self) -> float:
         """Rays that the fit will see, about: a constant per step or second, so that the design does not depend on the clock."""
-        return self.steps * self.recipe.samples_per_step / 10 if self.steps is not None else (self.budget or 0.0) * 70_000
+        return self.steps * self.recipe.sampling.samples_per_step / 10 if self.steps is not None else (self.budget or 0.0) * 70_000
 
     def run_step(self) -> None:
         """One optimiser step."""
@@ -114,18 +114,18 @@ class Trainer:
         random = np.random.default_rng((self.seed, 1, state.step))
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         sampling = sampling_at(self.progress, recipe, self.needs)
-        if state.step % recipe.occupancy_every == 0:
+        if state.step % recipe.sampling.occupancy_every == 0:
             share = 1.0 if state.step == 0 else 1 / 16
             sdf = lambda x: field.surface(x, sampling.active_surface)
             if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
                 state.reopened += 1
-        if state.tables is None and 0 < recipe.tables_at <= self.progress:
+        if state.tables is None and 0 < recipe.schedule.tables_at <= self.progress:
             self._size_tables(sampling, generator)
         if state.decided is None:
             # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
-            seen = 0 if self.progress < recipe.view_dependence_from else probe.DEGREES
+            seen = 0 if self.progress < recipe.schedule.view_dependence_from else probe.DEGREES
             field.view_dependence.update(dict.fromkeys(self.measurements, seen))
-            if self.progress >= recipe.decide_at:
+            if self.progress >= recipe.schedule.decide_at:
                 self._decide(sampling)
         if self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._see, sampling), self.progress)
@@ -156,12 +156,12 @@ class Trainer:
         for name, error in errors.items():
             self.mean_error[name] = keep * self.mean_error.get(name, error) + (1 - keep) * error
         done = self.progress
-        if recipe.average > 0 and done >= 1.0 - 4.0 * recipe.average and state.step % _AVERAGE_EVERY == 0:
-            self.average.update(recipe.average * state.step / max(done, 1e-9) / _AVERAGE_EVERY)
+        if recipe.schedule.ema_fraction > 0 and done >= 1.0 - 4.0 * recipe.schedule.ema_fraction and state.step % _AVERAGE_EVERY == 0:
+            self.average.update(recipe.schedule.ema_fraction * state.step / max(done, 1e-9) / _AVERAGE_EVERY)
         state.rays_total += len(batch.origins)
         state.samples_total += samples
         # a fixed number of samples a step; the number of rays follows, by at most a factor of two either way
-        ratio = min(2.0, max(0.5, recipe.samples_per_step / max(samples, 1)))
+        ratio = min(2.0, max(0.5, recipe.sampling.samples_per_step / max(samples, 1)))
         state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
         state.step += 1
 
@@ -180,12 +180,12 @@ class Trainer:
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_alpha:
             known = torch.isfinite(batch.alpha)
-            loss = loss + recipe.opacity * (hits.opacity - batch.alpha)[known].square().sum() / len(origins)
+            loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(origins)
         elif self.needs.black_background:
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, batch.ray, batch.target / batch.level, "amax") < 0.02
-            loss = loss + recipe.emptiness * (hits.opacity * black).mean()
-        if recipe.eikonal > 0:
-            loss = loss + recipe.eikonal * losses.eikonal(self._gradients(hits, origins, directions, sampling, generator))
+            loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
+        if recipe.loss.eikonal_weight > 0:
+            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, origins, directions, sampling, generator))
         return loss, errors, int(hits.samples)
 
     def _gain(self) -> torch.Tensor:
@@ -211,9 +211,10 @@ class Trainer:
         recipe, design = self.recipe, self.needs.design
         cells = cells_at_surface(self.field, sampling.active_surface, generator)
         names, active = ("surface", "radiance"), (sampling.active_surface, sampling.active_radiance)
-        levels = recipe.surface_levels, recipe.radiance_levels
+        levels = recipe.surface.levels, recipe.radiance.levels
         most = int(design.surface_rows_log2), int(design.radiance_rows_log2)  # type: ignore[arg-type]
-        rows = [rows_log2(n / recipe.cells_per_row, m) for n, m in zip(cells, most, strict=True)]
+        per_row = recipe.surface.cells_per_row, recipe.radiance.cells_per_row
+        rows = [rows_log2(n / share, m) for n, share, m in zip(cells, per_row, most, strict=True)]
         evidence = ", ".join(
             f"{name} 2^{r} for {n:.2g} cells" + (" (by the rays to come or the recipe no more)" if r == m else "")
             for name, r, m, n in zip(names, rows, most, cells, strict=True)
@@ -245,15 +246,17 @@ class Trainer:
         evidence = self.needs.evidence
         degrees, spreads, begin = {}, {}, 0
         usable = batch.target < batch.saturation
-        errors = probe.errors_by_degree(field.shader, hits.features, hits.opacity, batch) if recipe.view_dependence == "auto" else {}
+        errors = (
+            probe.errors_by_degree(field.shader, hits.features, hits.opacity, batch) if recipe.radiance.view_dependence == "auto" else {}
+        )
         for name, (_, numbers) in batch.parts.items():
-            if recipe.view_dependence == "auto":
-                degree = probe.degree_needed(errors[name], recipe.view_dependence_worth)
+            if recipe.radiance.view_dependence == "auto":
+                degree = probe.degree_needed(errors[name], recipe.radiance.view_dependence_min_improvement)
                 best = errors[name][-1]
                 grown = ", ".join(f"{e / best - 1:+.1%}" for e in errors[name][:-1]) if best > 0 else "nothing that could be told apart"
                 evidence[f"view_dependence.{name}"] = f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}"
             else:
-                degree = recipe.view_dependence
+                degree = recipe.radiance.view_dependence
                 evidence[f"view_dependence.{name}"] = f"degree {degree}: asked for by the recipe"
             degrees[name] = degree
             level, frames = field.radiance_scale[name], len(self.measurements[name].origins)
@@ -262,8 +265,8 @@ class Trainer:
             begin += frames
             spreads[name] = spread if spread > 2 * noise / math.sqrt(max(frames, 1)) else 0.0
         why = ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
-        asked = recipe.exposure != "auto"
-        exposure = recipe.exposure == "on" if asked else max(spreads.values()) > recipe.exposure_worth
+        asked = recipe.radiance.exposure != "auto"
+        exposure = recipe.radiance.exposure == "on" if asked else max(spreads.values()) > recipe.radiance.exposure_min_spread
         evidence["exposure"] = (
             f"{'on' if exposure else 'off'}: {'asked for by the recipe; ' if asked else ''}exposure differs between frames by {why}"
         )
@@ -279,7 +282,7 @@ class Trainer:
         generator: torch.Generator,
     ) -> torch.Tensor:
         """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""
-        count = self.recipe.eikonal_points
+        count = self.recipe.loss.eikonal_points
         extent = self.field.surface.grid.extent
         points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * extent).to(self.device)]
         hit = torch.nonzero(torch.isfinite(hits.depth))[:, 0]

@@ -22,7 +22,7 @@ from mmsynth.scene.load import load_scene
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = str(data_folder("example_scene"))
-JOB = Job("one", EXAMPLE, Recipe.model_validate({}), ("rgb", "pol"), {"pol": 3}, 0, 4, None)
+JOB = Job("one", EXAMPLE, Recipe(), ("rgb", "pol"), {"pol": 3}, 0, 4, None)
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_a_result_that_is_there_is_not_made_again(fits: list[str], tmp_path: Pat
         {"device": "cuda"},
         {"steps": 5},
         {"steps": None, "budget": 4.0},
-        {"recipe": Recipe.model_validate({"eikonal": 0.3})},
+        {"recipe": Recipe().with_changes({"loss.eikonal_weight": 0.3})},
         {"modalities": None},
         {"frames": {"pol": 2}},
     ],

@@ -17,20 +17,21 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
-from mmsynth.operations.conversion.files import source_views
+from mmsynth.operations.views.load import views_of_frames
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Scene, keep_frames
 
 SMALL = {
-    "samples_per_step": 4096, "rays_at_start": 256, "surface_levels": 4, "surface_rows_log2": 13, "radiance_levels": 5,
-    "radiance_rows_log2": 14, "occupancy_resolution": 32, "eikonal_points": 256, "radiance_hidden": 32, "view_dependence": 1,
+    "sampling.samples_per_step": 4096, "sampling.initial_rays": 256, "surface.levels": 4, "surface.max_rows_log2": 13,
+    "radiance.levels": 5, "radiance.max_rows_log2": 14, "sampling.occupancy_resolution": 32, "loss.eikonal_points": 256,
+    "radiance.hidden_width": 32, "radiance.view_dependence": 1,
 }  # fmt: skip
 STEPS = 400
 
 
 def _recipe(**changes: object) -> Recipe:
-    return Recipe.model_validate({**SMALL, **changes})
+    return Recipe().with_changes({**SMALL, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +102,9 @@ def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, v
     again = Field.load(tmp_path)
     for frame in off.frames:
         assert np.array_equal(again.pose_of(frame), field.pose_of(frame))
-    for camera, pose, name in source_views(again, off, "mono"):
-        frame = next(f for f in off.frames if f.sensor == "mono" and f"{f.view:04d}" == name)
-        assert camera == frame.camera and np.array_equal(pose, field.pose_of(frame))
+    for at in views_of_frames(again, off, "mono"):
+        frame = next(f for f in off.frames if f.sensor == "mono" and f"{f.view:04d}" == at.name)
+        assert at.camera == frame.camera and np.array_equal(at.camera_to_world, field.pose_of(frame))
     if views:
         view = off.split.train[0]
         frame = next(f for f in off.frames if f.sensor == "mono" and f.view == view)
@@ -118,7 +119,7 @@ def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, v
 
 
 def test_corrections_say_in_the_scenes_frame_where_the_cameras_stand_now(scene: Scene) -> None:
-    trainer = Trainer(_disturbed(scene, 1.0, 1.0), _recipe(poses="on", rig="on"), STEPS, None, 0, "cpu")
+    trainer = Trainer(_disturbed(scene, 1.0, 1.0), _recipe(**{"poses.views": "on", "poses.rig": "on"}), STEPS, None, 0, "cpu")
     random = np.random.default_rng(0)
     refinement = trainer.refinement
     refinement.motions = poses.Motions(
@@ -135,7 +136,7 @@ def test_corrections_say_in_the_scenes_frame_where_the_cameras_stand_now(scene: 
 
 
 def test_a_look_at_rays_leaves_the_next_step_alone(scene: Scene) -> None:
-    trainer = _run(Trainer(scene, _recipe(poses="off", rig="off"), STEPS, None, 0, "cpu"), 0.05)
+    trainer = _run(Trainer(scene, _recipe(**{"poses.views": "off", "poses.rig": "off"}), STEPS, None, 0, "cpu"), 0.05)
     sampling = sampling_at(trainer.progress, trainer.recipe, trainer.needs)
     rows = trainer._see(sampling, dict.fromkeys(trainer.measurements, 50), np.random.default_rng(0))
     assert len(rows.residual) == 150 and bool(torch.isfinite(rows.by_origin).all()) and bool((rows.by_direction != 0).any())
@@ -145,7 +146,7 @@ def test_a_look_at_rays_leaves_the_next_step_alone(scene: Scene) -> None:
 
 def test_a_broken_off_refinement_goes_on_to_the_same_field(scene: Scene, tmp_path: Path) -> None:
     off = _disturbed(keep_frames(scene, {"mono": 4, "pol": 4}), 2.0, 0.0)
-    recipe = _recipe(poses="on", rig="on", poses_at=0.1)
+    recipe = _recipe(**{"poses.views": "on", "poses.rig": "on", "poses.start_at": 0.1})
     whole = _run(Trainer(off, recipe, 60, None, 0, "cpu"))
     part = _run(Trainer(off, recipe, 60, None, 0, "cpu"), 0.5)
     assert part.refinement.steps > 1 and part.refinement.motions.views.any()
@@ -161,14 +162,21 @@ def test_a_broken_off_refinement_goes_on_to_the_same_field(scene: Scene, tmp_pat
 
 
 def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
-    forced = _run(Trainer(scene, _recipe(poses="on", rig="off", poses_at=0.0), 20, None, 0, "cpu"))
+    forced = _run(Trainer(scene, _recipe(**{"poses.views": "on", "poses.rig": "off", "poses.start_at": 0.0}), 20, None, 0, "cpu"))
     assert forced.refinement.decided == {"poses": True, "rig": False}
     assert "asked for by the recipe" in forced.needs.evidence["poses"] and "asked for by the recipe" in forced.needs.evidence["rig"]
     alone = dataclasses.replace(scene, split=dataclasses.replace(scene.split, train=scene.split.train[:1]))
-    one = _run(Trainer(alone, _recipe(poses="on", poses_at=0.0), 10, None, 0, "cpu"))
+    one = _run(Trainer(alone, _recipe(**{"poses.views": "on", "poses.start_at": 0.0}), 10, None, 0, "cpu"))
     assert one.refinement.decided is not None and not one.refinement.decided["poses"]
     assert one.needs.evidence["poses"] == "off: there is one view"
-    single = Trainer(load_scene(data_folder("example_scene"), modalities=["rgb"]), _recipe(rig="on", poses="off"), 10, None, 0, "cpu")
+    single = Trainer(
+        load_scene(data_folder("example_scene"), modalities=["rgb"]),
+        _recipe(**{"poses.rig": "on", "poses.views": "off"}),
+        10,
+        None,
+        0,
+        "cpu",
+    )
     assert single.needs.evidence["rig"] == "off: no two sensors share views"
 
 

@@ -195,7 +195,7 @@ def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
     for seed in range(3):
         for name, below in (("joint", 0.0), ("ours", QUICK.scarce_below)):
             folder = write_scene(tmp_path / "scene", poses, alter=wrong)
-            recipe = Recipe.model_validate({**QUICK.model_dump(), "scarce_below": below})
+            recipe = QUICK.with_changes({"sampling.sparse_below": below})
             field = fit(load_scene(folder), tmp_path / "run", recipe=recipe, steps=200, seed=seed)
             assert field.manifest["needs"]["scarce"] == (("mono",) if name == "ours" else ())
             psnr[name].append(evaluate(field, load_scene(folder))["modalities"]["rgb"]["psnr"])
@@ -271,7 +271,7 @@ def test_cameras_inside_the_region(row: Row, tmp_path: Path) -> None:
         pose[:3, :3] = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
         pose[:3, 3] *= 0.05
         outwards.append(pose)
-    recipe = Recipe.model_validate({**QUICK.model_dump(), "background": "on"})
+    recipe = QUICK.with_changes({"surface.background": "on"})
     paint = lambda image: 0.3 + 0.2 * np.random.default_rng(0).random(image.shape)
     field = _fit(tmp_path, {"rgb": outwards}, recipe=recipe, alter={"rgb": paint})
     # NeuS, near_far_from_sphere: one radius before and one behind the point nearest to the centre
