@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -51,6 +51,7 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.choices import Choice, choices_of, summary
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
     from mmsynth.fitting.trainer import FitProgress
@@ -72,20 +73,19 @@ def fit(
 
         told: set[str] = set()
 
-        def explain(evidence: dict[str, str]) -> None:
-            for what, why in evidence.items():
-                if what not in told:
-                    say(f"needs {what}: {why}")
-            told.update(evidence)
+        def explain(choices: dict[str, Choice[Any]]) -> None:
+            for line in summary({name: choice for name, choice in choices.items() if name not in told}, verbose=True):
+                say(f"needs {line}")
+            told.update(choices)
 
         def on_start(needs: Needs) -> None:
-            explain(needs.evidence)
+            explain(needs.choices)
 
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
             on_start=on_start, on_step=on_step,
         )  # fmt: skip
-        explain(fitted.field.manifest["needs"]["evidence"])  # with what residuals decided on the way
+        explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
     print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
 
 
