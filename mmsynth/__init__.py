@@ -7,7 +7,8 @@ What a command does is one call:
 * ``mmsynth evaluate``: ``evaluate_run(open_run())``, ``evaluate_conversions``. ``evaluate``: the scores alone.
 * ``mmsynth convert``: ``convert_files``. ``convert``: tensors in, tensors out.
 * ``mmsynth generate-dataset``: ``generate_dataset``, ``verify_dataset``. ``AlignedDataset`` reads one for training.
-* ``mmsynth simulate``: ``simulate``. ``SensorTwin``: the effects of one sensor on tensors. ``mmsynth calibrate-noise``: ``calibrate_noise``.
+* ``mmsynth simulate``: ``simulate``. ``SensorTwin``: the effects of one sensor on tensors.
+* ``mmsynth calibrate-noise``: ``calibrate_noise``.
 * ``mmsynth mesh``: ``mesh_to_file``. ``extract_mesh`` and ``write_mesh``: in memory, then to a file.
 * ``mmsynth batch``: ``run_batch``.
 
