@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 
 WIDTH, HEIGHT = 24, 18
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -33,7 +33,7 @@ from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.operations.output.records import field_hash
 from mmsynth.operations.output.work_partition import Share
 from mmsynth.operations.views.trajectories import View
-from mmsynth.scene.images import write_dng, write_png, write_tiff
+from mmsynth.scene.image_writers import write_dng, write_png, write_tiff
 from mmsynth.scene.layouts.mmsdata import meta_content
 from mmsynth.scene.scene import PosedCamera, Scene, Sensor, canonical_modality
 from mmsynth.scene.serialisation import CONVENTIONS, posed_to_json
