@@ -33,12 +33,6 @@ def view_ids(text: str | None) -> tuple[int, ...] | None:
     return tuple(int(v) for v in text.split(","))
 
 
-def poses_file(path: Path, folder: Path) -> Path:
-    """As given, else in the scene's folder."""
-    within = folder / path
-    return within if not path.exists() and within.exists() else path
-
-
 def frame_limits(text: str | None) -> dict[str, int]:
     from mmsynth.scene.scene import canonical_modality
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -24,6 +24,10 @@ from mmsynth.cli.arguments import (
 )
 from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
+
+if TYPE_CHECKING:
+    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.views.load import Rig
 
 
 @command("info")
@@ -132,16 +136,18 @@ def batch(
     """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.operations.output.work_partition import share_of_environment
+    from mmsynth.operations.output.work_partition import partition_of_environment
     from mmsynth.workflows.batch import Job, read_scene_list, run_batch
 
     seconds = fit_length(steps, budget)
-    listed, share = read_scene_list(scenes), share_of_environment()
+    listed, part = read_scene_list(scenes), partition_of_environment()
     names = modality_names(modalities)
     job = Job(
-        load_recipe(recipe), steps, seconds, seed, pick_device(device), None if names is None else tuple(names), poses, rig, file_format
-    )
-    outcomes = run_batch(listed, out, job, share, say=(lambda text: None) if as_json else print)
+        load_recipe(recipe), steps, seconds, seed, pick_device(device),
+        modalities=None if names is None else tuple(names), poses=poses,
+        rig=cast("Rig", rig), file_format=cast("DatasetFormat", file_format),
+    )  # fmt: skip
+    outcomes = run_batch(listed, out, job, part, say=(lambda text: None) if as_json else print)
     if as_json:
         print(json.dumps({"out": str(out), "scenes": outcomes}))
     failed = [name for name, outcome in outcomes.items() if "error" in outcome]

@@ -38,7 +38,7 @@ def open_field(folder: Path | None = None, *, device: str = "cpu") -> tuple[Path
     Raises:
         InputError: there is no such run, or nothing was fitted in the working folder.
     """
-    folder = folder or _latest()
+    folder = folder or latest_run()
     return folder, Field.load(folder, device)
 
 
@@ -81,7 +81,7 @@ def mark_latest(run: Path) -> None:
     os.replace(temporary, link)
 
 
-def _latest() -> Path:
+def latest_run() -> Path:
     latest = _RUNS / "latest"
     if not latest.is_dir():
         raise InputError(f"{latest}: no finished fit in this folder; run `mmsynth fit SCENE` first.")

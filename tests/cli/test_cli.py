@@ -110,6 +110,7 @@ def test_every_public_name_is_there() -> None:
     import mmsynth
 
     assert all(callable(getattr(mmsynth, name)) for name in mmsynth.__all__)
+    assert set(mmsynth.__all__) == set(mmsynth._HOMES)
 
 
 def test_convert_at_poses(fitted: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
-from mmsynth.operations.conversion.files import source_views
+from mmsynth.operations.views.load import views_of_frames
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Scene, keep_frames
@@ -102,9 +102,9 @@ def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, v
     again = Field.load(tmp_path)
     for frame in off.frames:
         assert np.array_equal(again.pose_of(frame), field.pose_of(frame))
-    for camera, pose, name in source_views(again, off, "mono"):
-        frame = next(f for f in off.frames if f.sensor == "mono" and f"{f.view:04d}" == name)
-        assert camera == frame.camera and np.array_equal(pose, field.pose_of(frame))
+    for at in views_of_frames(again, off, "mono"):
+        frame = next(f for f in off.frames if f.sensor == "mono" and f"{f.view:04d}" == at.name)
+        assert at.camera == frame.camera and np.array_equal(at.camera_to_world, field.pose_of(frame))
     if views:
         view = off.split.train[0]
         frame = next(f for f in off.frames if f.sensor == "mono" and f.view == view)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -29,7 +29,8 @@ from mmsynth.scene.serialisation import channels_to_json
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
-FORMATS = ("npz", "exr", "tiff")
+RecordFormat = Literal["npz", "exr", "tiff"]
+RECORD_FORMATS: tuple[RecordFormat, ...] = get_args(RecordFormat)
 UNITS = {"data": "full scale", "stokes": "full scale", "raw": "full scale", "flow": "px"}
 
 _PARTS = {
@@ -56,7 +57,13 @@ def modality_arrays(values: np.ndarray, stokes: np.ndarray | None) -> dict[str, 
 
 
 def write_record(
-    folder: Path, stem: str, arrays: Mapping[str, np.ndarray], format: str, units: Mapping[str, str], sensor: Sensor | None = None
+    folder: Path,
+    stem: str,
+    arrays: Mapping[str, np.ndarray],
+    file_format: RecordFormat,
+    *,
+    units: Mapping[str, str],
+    sensor: Sensor | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Write a record.
 
@@ -80,11 +87,11 @@ def write_record(
         return {"record": stem, "sha256": sha256_of(path), "bytes": path.stat().st_size, "arrays": described, **about}
 
     own = {key: str(array.dtype) for key, array in arrays.items()}
-    if format == "npz":
+    if file_format == "npz":
         path = folder / f"{stem}.npz"
         write_npz(path, {**arrays, **_labels_of(sensor)})
         return {path.name: entry(path, own)}
-    if format == "exr":
+    if file_format == "exr":
         path = folder / f"{stem}.exr"
         named = {key: _names(key, array, sensor) for key, array in arrays.items()}
         channels = {name: plane for key, array in arrays.items() for name, plane in zip(named[key], _planes(array), strict=True)}

@@ -1,30 +1,21 @@
-"""Where to render from: poses files and generated camera paths.
+"""Generated camera paths.
 
-A view is ``(camera, camera_to_world, name)``: intrinsics with lens, (4, 4) float64 pose with OpenCV axes in the scene's world frame
-and unit, and a name. Generated paths turn around the region of interest and look at its centre (up is the training cameras' mean up), or
-follow the training poses.
+They turn around the region of interest and look at its centre (up is the training cameras' mean up), or follow the training
+poses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from mmsynth.errors import InputError
-from mmsynth.files import read_json
 from mmsynth.scene.checks import number, whole
-from mmsynth.scene.load import read_poses
-from mmsynth.scene.scene import Region, Scene
+from mmsynth.scene.scene import PosedCamera, Region
 from mmsynth.sensors.camera import Camera
-
-if TYPE_CHECKING:
-    from mmsynth.field.field import Field
-
-View = tuple[Camera, np.ndarray, str]
 
 _KEYS: dict[str, dict[str, Any]] = {
     "orbit": {"views": 60, "elevation_deg": 25.0, "radius": None},
@@ -147,7 +138,7 @@ def _directions(kind: str, spec: Mapping[str, Any], where: str) -> tuple[np.ndar
 
 def trajectory_views(
     spec: Mapping[str, Any], region: Region, camera: Camera, training: Sequence[np.ndarray], where: str = "trajectory"
-) -> list[View]:
+) -> list[PosedCamera]:
     """A generated camera path.
 
     * ``{"trajectory": "orbit", "views": 60, "elevation_deg": 25, "radius": r}``: a circle, starting at the first training camera's side;
@@ -189,52 +180,4 @@ def trajectory_views(
         azimuth, sine = _directions(kind, spec, where)
         radius = reach if spec["radius"] is None else number(spec, "radius", where, 1e-9, 1e9)
         poses = _around(azimuth, sine, radius, region, training)
-    return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
-
-
-def reference_camera(field: Field) -> Camera:
-    """Intrinsics of the field's first sensor that has any.
-
-    Raises:
-        InputError: the field stores no camera.
-    """
-    for name in field.sensors:
-        if name in field.cameras:
-            return field.cameras[name]
-    raise InputError("field: it stores no camera, expected poses with intrinsics.")
-
-
-def training_poses(field: Field, scene: Scene) -> list[np.ndarray]:
-    """(4, 4) poses of the reference sensor's training views, in view order, as the fit corrected them."""
-    for name in scene.sensors:
-        frames = scene.frames_of(name, scene.split.train)
-        if frames:
-            return [field.pose_of(frame) for frame in frames]
-    return []
-
-
-def load_views(path: Path | str, field: Field, scene: Scene | None = None, sensor: str | None = None) -> list[View]:
-    """Read a poses file or a trajectory (JSON with the key 'trajectory'); in the scene's world frame and unit.
-
-    Poses without intrinsics, and trajectories, take the camera of ``sensor``; None: the reference camera of the field.
-
-    Args:
-        scene: needed for a trajectory only: its training poses say what is up and how far away to be.
-    Raises:
-        InputError: unreadable file, unknown layout, or bad value.
-    """
-    path = Path(path)
-    own = None if sensor is None else field.cameras.get(sensor)
-    if path.suffix.lower() == ".json":
-        content = read_json(path)
-        if isinstance(content, dict) and "trajectory" in content:
-            training = training_poses(field, scene) if scene is not None else []
-            return trajectory_views(content, field.region, own or reference_camera(field), training, str(path))
-    poses = read_poses(path)
-    fallback = own or reference_camera(field) if any(pose.camera is None for pose in poses) else None
-    views: list[View] = []
-    for pose in poses:
-        chosen = pose.camera or fallback
-        assert chosen is not None
-        views.append((chosen, pose.camera_to_world, pose.name))
-    return views
+    return [PosedCamera(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]

@@ -17,7 +17,7 @@ from scipy.ndimage import map_coordinates
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
 from mmsynth.fitting.motions import motion_of, rigid
-from mmsynth.operations.conversion.files import convert_images
+from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.register import Landmarks, landmarks, register
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Split
@@ -124,14 +124,14 @@ def test_a_frame_of_something_else_is_refused(field: Field, scene: Scene, what: 
 def test_images_without_a_pose_are_converted(field: Field, scene: Scene, tmp_path: Path) -> None:
     pose = ring_pose(3, 24)
     write_png16(tmp_path / "photo.png", _raw(field, pose, 5))
-    convert_images(field, scene, "rgb", "rgb", [tmp_path / "photo.png"], tmp_path / "out")
+    convert_files(field, scene, tmp_path / "out", source="rgb", target="rgb", images=[tmp_path / "photo.png"])
     facts: dict[str, Any] = json.loads((tmp_path / "out/rgb/photo.json").read_text())
     np.testing.assert_allclose(facts["camera"]["camera_to_world"], pose, atol=2e-3)
     assert facts["registration"]["sd_px"] < 0.1 and np.shape(facts["registration"]["covariance"]) == (6, 6)
     write_png16(tmp_path / "other.png", np.random.default_rng(0).random((120, 160)))
     with pytest.raises(InputError, match=r"other\.png: "):
-        convert_images(field, scene, "rgb", "rgb", [tmp_path / "other.png"], tmp_path / "refused")
+        convert_files(field, scene, tmp_path / "refused", source="rgb", target="rgb", images=[tmp_path / "other.png"])
     assert not (tmp_path / "refused").exists()
     write_png16(tmp_path / "small.png", np.zeros((12, 16)))
     with pytest.raises(InputError, match=r"small\.png: the image is 16x12 pixels, expected 160x120"):
-        convert_images(field, scene, "rgb", "rgb", [tmp_path / "small.png"], tmp_path / "refused")
+        convert_files(field, scene, tmp_path / "refused", source="rgb", target="rgb", images=[tmp_path / "small.png"])

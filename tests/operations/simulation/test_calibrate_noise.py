@@ -17,6 +17,7 @@ from mmsynth.operations.simulation.calibrate_noise import by_modality, calibrate
 from mmsynth.operations.simulation.simulate import simulate
 from mmsynth.scene.image_writers import write_npz, write_png
 from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.noise import NoiseModel, record
 from mmsynth.sensors.sensor_file import SensorFile, load_sensor, save_sensor
@@ -64,8 +65,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulate(
         field,
         [sensor_file(s.name, folder) for s in (RGB, MS, POL, MONO)],
-        [(camera, ring_pose(i, 6), str(i)) for i in range(6)],
         folder / "scene",
+        views=[PosedCamera(camera, ring_pose(i, 6), str(i)) for i in range(6)],
     )
     return folder
 
