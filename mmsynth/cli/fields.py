@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 @command("info")
 def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
-    from mmsynth.scene.info import describe, render_text
+    from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
 
-    description = describe(load_scene(scene_path(scene)))
+    description = describe_scene(load_scene(scene_path(scene)))
     print(json.dumps(description) if as_json else render_text(description))
 
 

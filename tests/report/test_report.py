@@ -13,7 +13,7 @@ from analytic import AnalyticField, scene_of, sphere
 
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 
