@@ -126,8 +126,10 @@ def _source(image: np.ndarray) -> str:
 
 
 def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
-    """A frame with all channels at every pixel (H, W, C), demosaicked for display."""
-    pixels, _ = load_frame(sensor, frame)
+    """A frame with all channels at every pixel (H, W, C), demosaicked for display; what is transparent is black, as for the scores."""
+    pixels, alpha = load_frame(sensor, frame)
+    if alpha is not None:
+        return pixels * alpha[..., None]
     if sensor.mosaic is not None and is_bayer(sensor.mosaic):
         return np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
     return channels_of(pixels, sensor.mosaic)
@@ -215,6 +217,7 @@ _RUN_FACTS = ("mmsynth", "seed", "steps", "seconds", "rays_per_s", "samples_per_
 def write_run_report(
     run_dir: Path | str,
     field: Field,
+    *,
     evaluation: Mapping[str, Any] | None = None,
     train_log: Path | Sequence[Mapping[str, Any]] | None = None,
     scene: Scene | None = None,

@@ -28,7 +28,7 @@ def test_report(tmp_path: Path) -> None:
     }
     log = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
     evaluation = evaluate(field, scene)  # type: ignore[arg-type]
-    page = write_run_report(tmp_path, field, evaluation, log, scene).read_text()  # type: ignore[arg-type]
+    page = write_run_report(tmp_path, field, evaluation=evaluation, train_log=log, scene=scene).read_text()  # type: ignore[arg-type]
     assert page.count("data:image/png;base64,") == 3 * 4 + 2 + 3  # frame, rendering, difference; polarization; geometry
     assert (tmp_path / "preview.png").is_file()
     assert "&lt;nothing&gt;" in page and "<nothing>" not in page
@@ -68,3 +68,12 @@ def test_previews_of_a_mosaic_show_every_channel_in_its_place(tmp_path: Path, pa
         codes = {(1, 2): cv2.COLOR_BayerGR2RGB_EA, (2, 1): cv2.COLOR_BayerRG2RGB_EA}
         theirs = cv2.demosaicing(np.round(raw * 65535).astype(np.uint16), codes[tuple(pattern[0])]) / 65535
         np.testing.assert_allclose(shown, theirs, atol=1e-5)
+
+
+def test_previews_show_what_is_transparent_as_black(tmp_path: Path) -> None:
+    rgba = np.full((4, 6, 4), 200, np.uint8)
+    rgba[:, 3:, 3] = 0
+    cv2.imwrite(str(tmp_path / "0.png"), rgba)
+    sensor = Sensor("rgb", tuple("RGB"), (None,) * 3)
+    shown = measured_channels(sensor, Frame("rgb", 0, tmp_path / "0.png", Camera(6, 4, 5.0, 5.0, 2.5, 1.5), np.eye(4)))
+    assert (shown[:, :3] > 0.1).all() and (shown[:, 3:] == 0).all()
