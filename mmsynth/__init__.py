@@ -2,17 +2,15 @@
 
 What a command does is one call:
 
-========================== ==========================================================================================
-``mmsynth info``           ``load_scene(path)`` → ``Scene``: sensors, frames with cameras and poses, split, problems
-``mmsynth fit``            ``fit_run(scene)`` → ``Run``: a fit with its report, and ``runs/latest``; ``fit``: the field alone
-``mmsynth evaluate``       ``evaluate_run(open_run())``, ``evaluate_conversions``; ``evaluate``: the scores alone
-``mmsynth convert``        ``convert_files``; ``convert``: tensors in, tensors out
-``mmsynth generate-dataset`` ``generate_dataset``, ``verify_dataset``; ``AlignedDataset`` reads one for training
-``mmsynth simulate``       ``simulate``; ``SensorTwin``: the effects of one sensor on tensors
-``mmsynth calibrate-noise`` ``calibrate_noise``
-``mmsynth mesh``           ``mesh_to_file``; ``extract_mesh`` and ``write_mesh``
-``mmsynth batch``          ``run_batch``
-========================== ==========================================================================================
+* ``mmsynth info``: ``load_scene`` → ``Scene``: sensors, frames with cameras and poses, split, problems.
+* ``mmsynth fit``: ``fit_run`` → ``Run``: a fit with its report and ``runs/latest``. ``fit``: the field alone.
+* ``mmsynth evaluate``: ``evaluate_run(open_run())``, ``evaluate_conversions``. ``evaluate``: the scores alone.
+* ``mmsynth convert``: ``convert_files``. ``convert``: tensors in, tensors out.
+* ``mmsynth generate-dataset``: ``generate_dataset``, ``verify_dataset``. ``AlignedDataset`` reads one for training.
+* ``mmsynth simulate``: ``simulate``. ``SensorTwin``: the effects of one sensor on tensors.
+* ``mmsynth calibrate-noise``: ``calibrate_noise``.
+* ``mmsynth mesh``: ``mesh_to_file``. ``extract_mesh`` and ``write_mesh``: in memory, then to a file.
+* ``mmsynth batch``: ``run_batch``.
 
 A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. A ``Recipe`` holds every number of a fit. Bad input raises
 ``InputError``, a fit that diverged ``DivergedError``, with one sentence each. Names are loaded when first used, so that ``mmsynth --help``

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 

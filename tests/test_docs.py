@@ -170,8 +170,10 @@ def test_ten_lines_of_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert printed in block
         block = block.replace(printed, tested)
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "poses.json").write_text('{"trajectory": "orbit", "views": 2}')
     made: dict[str, Any] = {"MeshOptions": MeshOptions}
     exec(compile(block, "README.md", "exec"), made)
-    assert (tmp_path / "mesh.ply").is_file()
+    for written in ("runs/latest/report.html", "converted/ms/0009.npz", "dataset/dataset.json", "mesh.ply"):
+        assert (tmp_path / written).is_file()
     camera = made["frame"].camera
     assert made["seen"].channels["ms"].shape == (camera.height, camera.width, 9)

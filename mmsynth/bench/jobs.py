@@ -1,8 +1,8 @@
 """Fits to be measured, each in a process of its own, each result on disk as soon as it is there.
 
 A result lies in ``OUT/rows/<name>-<digest>.json``, and the digest is that of everything the result depends on (``identity``): pixels,
-poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result that is there is the result, and a
-bench that was killed goes on where it was.
+poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result on disk is never out of date, and a
+benchmark that was interrupted continues where it was.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 @command("info")
 def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
-    from mmsynth.scene.info import describe, render_text
+    from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
 
-    description = describe(load_scene(scene_path(scene)))
+    description = describe_scene(load_scene(scene_path(scene)))
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -55,6 +55,7 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.choices import Choice, choices_of, summary
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
     from mmsynth.fitting.trainer import FitProgress
@@ -76,20 +77,19 @@ def fit(
 
         told: set[str] = set()
 
-        def explain(evidence: dict[str, str]) -> None:
-            for what, why in evidence.items():
-                if what not in told:
-                    say(f"needs {what}: {why}")
-            told.update(evidence)
+        def explain(choices: dict[str, Choice[Any]]) -> None:
+            for line in summary({name: choice for name, choice in choices.items() if name not in told}, verbose=True):
+                say(f"needs {line}")
+            told.update(choices)
 
         def on_start(needs: Needs) -> None:
-            explain(needs.evidence)
+            explain(needs.choices)
 
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
             on_start=on_start, on_step=on_step,
         )  # fmt: skip
-        explain(fitted.field.manifest["needs"]["evidence"])  # with what residuals decided on the way
+        explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
     print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,11 @@ class Batch:
     parts: dict[str, tuple[slice, slice]]
     alpha: Tensor
 
+    def per_ray(self, values: Mapping[str, float]) -> Tensor:
+        """A value for each modality → one for each ray, (R,)."""
+        counts = [rays.stop - rays.start for rays, _ in self.parts.values()]
+        return torch.from_numpy(np.repeat([values[n] for n in self.parts], counts)).to(self.origins.device)
+
 
 class Measurements:
     """All training pixels of one modality.
@@ -70,7 +76,7 @@ class Measurements:
         self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
         poses = np.stack([f.camera_to_world for f in frames])
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
-        self.place(poses)
+        self.set_poses(poses)
         self.directions, self.usable = [], []
         for camera in self.cameras:
             rays, valid = ray_map(camera)
@@ -84,7 +90,7 @@ class Measurements:
         drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
         self.level = float(self.read(drawn, pixel)[0].mean())
 
-    def place(self, poses: np.ndarray) -> None:
+    def set_poses(self, poses: np.ndarray) -> None:
         """Let the frames be at (F, 4, 4) camera_to_world, normalised frame."""
         self.rotations = poses[:, :3, :3].astype(np.float32)
         self.origins = poses[:, :3, 3].astype(np.float32)

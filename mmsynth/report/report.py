@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_text
+from mmsynth.fitting.choices import choices_of
 from mmsynth.operations.output import previews
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor
@@ -238,7 +239,9 @@ def write_run_report(
     region = field.region
     centre = ", ".join(f"{c:.4g}" for c in region.centre)
     facts = _flat({key: manifest[key] for key in _RUN_FACTS if key in manifest})
-    needed = _flat(needs.get("evidence", {})) + _flat({k: v for k, v in needs.items() if k != "evidence"})
+    needed = [(name, choice.why) for name, choice in choices_of(manifest).items()] + _flat(
+        {k: v for k, v in needs.items() if k != "choices"}
+    )
     page = {
         "title": f"mmsynth: {name}",
         "subtitle": f"{len(field.sensors)} modalities: {', '.join(field.sensors)}. "

@@ -25,7 +25,7 @@ _ROUND_TRIP = 1e-3  # pixels
 
 
 def load_scene(path: Path | str, *, modalities: Sequence[str] | None = None) -> Scene:
-    """Read a scene; the format is told by what the folder holds.
+    """Read a scene; its layout is recognised by the files in the folder.
 
     ``meta_data.json``: MMS-DATA; ``transforms.json``: nerfstudio or instant-ngp; ``*_par.txt``: Middlebury.
 

@@ -198,7 +198,7 @@ def depth_along_rays(camera: Camera, depth_z: np.ndarray) -> np.ndarray:
 
 
 def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:
-    """How well rays of pixels (N, 2) come back.
+    """How well the inverse of the lens model works at pixels (N, 2).
 
     Returns:
         the largest distance [px] between a pixel and the projection of its ray in float32, as rays are cast (NaN where no pixel has

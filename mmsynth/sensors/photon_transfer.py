@@ -15,10 +15,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
+import cv2
 import numpy as np
-from scipy.ndimage import maximum_filter, uniform_filter
 
 from mmsynth.errors import InputError
+from mmsynth.sensors.filters import box_mean
 from mmsynth.sensors.mosaic import photosites_of
 from mmsynth.sensors.noise_likelihood import TEXTURE, Estimate, Name, Parameters, Values, estimate_of, most_likely, outlier_variance
 
@@ -168,9 +169,9 @@ def _differences(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, whi
     near = lambda image, step, axis: (np.roll(image, step, axis), np.roll(image, -step, axis))
     # of every channel at every pixel: what lies between the photosites of a channel is seen, too
     square = sum(0.5 * sum((n - expected) ** 2 for n in near(expected, step, axis)) for step, axis in steps)
-    activity = photosites_of(uniform_filter(square, (_WINDOW, _WINDOW, 0), mode="nearest"), pattern)
+    activity = photosites_of(box_mean(square, _WINDOW), pattern)
     expected = photosites_of(expected, pattern)
-    usable = np.isfinite(activity) & (maximum_filter(raw, (2 * rows + 1, 2 * columns + 1)) < UNCLIPPED * white)
+    usable = np.isfinite(activity) & (cv2.dilate(raw, np.ones((2 * rows + 1, 2 * columns + 1), np.uint8)) < UNCLIPPED * white)
     edge = (rows + _WINDOW // 2, columns + _WINDOW // 2)
     usable[: edge[0]] = usable[-edge[0] :] = False
     usable[:, : edge[1]] = usable[:, -edge[1] :] = False

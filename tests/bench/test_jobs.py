@@ -137,7 +137,8 @@ def test_a_broken_result_is_named(fits: list[str], tmp_path: Path) -> None:
 
 
 def test_the_scene_hash_covers_pixels_and_poses(write_mmsdata: Any) -> None:
-    from mmsynth.scene.images import read_native, write_png16
+    from mmsynth.scene.image_writers import write_png16
+    from mmsynth.scene.images import read_native
 
     root = write_mmsdata()
     before = scene_hash(load_scene(root))

@@ -13,7 +13,7 @@ from analytic import AnalyticField, scene_of, sphere
 
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 
@@ -21,7 +21,11 @@ from mmsynth.sensors.camera import Camera
 def test_report(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene")
-    field.manifest = {"needs": {"evidence": {"background": "off: <nothing> there"}, "footprint": 0.01}, "seed": 7, "seconds": {"fit": 60.5}}
+    field.manifest = {
+        "needs": {"choices": {"background": {"value": False, "why": "off: <nothing> there", "changed": False}}, "footprint": 0.01},
+        "seed": 7,
+        "seconds": {"fit": 60.5},
+    }
     log = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
     evaluation = evaluate(field, scene)  # type: ignore[arg-type]
     page = write_run_report(tmp_path, field, evaluation, log, scene).read_text()  # type: ignore[arg-type]

@@ -19,7 +19,7 @@ from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.operations.views.trajectories import trajectory_views
 from mmsynth.packaged import data_folder
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.load import load_scene, read_poses
 from mmsynth.scene.scene import Region
 from mmsynth.sensors.camera import Camera

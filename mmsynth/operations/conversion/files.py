@@ -18,7 +18,8 @@ from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.operations.output.records import RECORD_FORMATS, UNITS, RecordFormat, modality_arrays, write_record
 from mmsynth.operations.views.coverage import TrainingRays, training_rays
 from mmsynth.operations.views.load import load_views, on_the_rig, views_of_frames
-from mmsynth.scene.images import load_frame, write_png16
+from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, PosedCamera, Scene, Sensor, canonical_modality
 from mmsynth.scene.serialisation import CONVENTIONS, channels_to_json, posed_to_json
 from mmsynth.sensors.mosaic import photosites_of

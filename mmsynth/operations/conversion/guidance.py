@@ -19,9 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, uniform_filter
 
 from mmsynth.scene.scene import Sensor
+from mmsynth.sensors.filters import box_mean, gaussian_mean
 from mmsynth.sensors.mosaic import channels_of, photosites_of
 
 # of a photosite whose sensor nobody calibrated: shot noise of 10,000 electrons at full scale, and a floor
@@ -73,7 +73,7 @@ def guide(raw: np.ndarray, rendered: np.ndarray, sensor: Sensor, valid: np.ndarr
     # τ² from what is left beyond noise, robust against things that are not in the field
     difference = np.where(used, seen - expected, 0.0)
     prior = _prior(difference, expected, variance, used)
-    window = lambda x: gaussian_filter(x, _WINDOW, mode="nearest") / _centre(_WINDOW)
+    window = lambda x: gaussian_mean(x, _WINDOW) / _centre(_WINDOW)
     power, product = window((weight * expected**2).sum(-1)), window((weight * seen * expected).sum(-1))
     precision = power + 1.0 / prior**2
     gain = (product + 1.0 / prior**2) / precision
@@ -86,7 +86,7 @@ def _centre(sigma: float) -> float:
     """What a single value keeps under the filter: sums over the window, in units of it."""
     impulse = np.zeros((9, 9))
     impulse[4, 4] = 1.0
-    return float(gaussian_filter(impulse, sigma)[4, 4])
+    return float(gaussian_mean(impulse, sigma)[4, 4])
 
 
 def _exposure(seen: np.ndarray, expected: np.ndarray, weight: np.ndarray) -> float:
@@ -118,12 +118,12 @@ def _residual_colour(
     known = np.where(used, left, 0.0)
     full = channels_of(known if sensor.mosaic is None else known[..., 0], sensor.mosaic)
     noise = np.broadcast_to(variance, full.shape)
-    smooth = lambda x: gaussian_filter(x, (_COLOUR_WINDOW, _COLOUR_WINDOW, 0), mode="nearest")
+    smooth = lambda x: gaussian_mean(x, _COLOUR_WINDOW)
     low = smooth(full)
     # of independent values a window of σ leaves 1 / (4 π σ²) of the variance; a mosaic has fewer of each channel
     tile = 1 if sensor.mosaic is None else sensor.mosaic.size
     noise_left = smooth(noise) * min(1.0, tile / (4.0 * np.pi * _COLOUR_WINDOW**2))
-    power = uniform_filter(low**2, (9, 9, 0), mode="nearest")
+    power = box_mean(low**2, 9)
     colour = low * np.clip(1.0 - noise_left / np.maximum(power, 1e-12), 0.0, 1.0)
     if full.shape[-1] == 1:
         colour = np.zeros_like(colour)  # one channel has no colour
@@ -141,7 +141,7 @@ def gain_exponent(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> 
     """
     log = lambda a: np.log(np.maximum(np.where(valid[..., None], a, 0.0), 0.0).astype(np.float64) + _DARK)
     x, y = log(source.mean(-1, keepdims=True)), log(target)
-    mean = lambda a: uniform_filter(a, (2 * _MAP_RADIUS + 1, 2 * _MAP_RADIUS + 1, 0), mode="nearest")
+    mean = lambda a: box_mean(a, 2 * _MAP_RADIUS + 1)
     mx, my = mean(x), mean(y)
     return np.asarray(np.clip((mean(x * y) - mx * my + _PLAIN) / (mean(x * x) - mx * mx + _PLAIN), 0.0, 1.0))
 
@@ -149,7 +149,8 @@ def gain_exponent(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> 
 def linear_map(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """(H, W, K, C): how the target's channels vary with the source's around each pixel, in the field's own renderings.
 
-    Ridge regression in windows of 9 x 9 pixels, shrunk to the map of the whole picture where a window is plain.
+    Ridge regression in windows of 9 x 9 pixels, shrunk to the map of the whole picture where a window is plain (the guided filters of
+    OpenCV and kornia shrink it to 0, and keep the map to themselves).
 
     Args:
         source: (H, W, C). target: (H, W, K).
@@ -158,7 +159,7 @@ def linear_map(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.
     flat_x, flat_y = x[valid], y[valid]
     ridge = _MAP_RIDGE * np.eye(x.shape[-1])
     whole = np.linalg.solve(flat_x.T @ flat_x + ridge * len(flat_x), flat_x.T @ flat_y).T
-    mean = lambda a: uniform_filter(a, (2 * _MAP_RADIUS + 1,) * 2 + (0,) * (a.ndim - 2), mode="nearest")
+    mean = lambda a: box_mean(a, 2 * _MAP_RADIUS + 1)
     mx, my = mean(x), mean(y)
     of_x = mean(x[..., :, None] * x[..., None, :]) - mx[..., :, None] * mx[..., None, :]
     of_both = mean(y[..., :, None] * x[..., None, :]) - my[..., :, None] * mx[..., None, :]

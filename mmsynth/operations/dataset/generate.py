@@ -52,7 +52,7 @@ from mmsynth.operations.simulation.simulate import simulate
 from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, training_rays, view_scores
 from mmsynth.operations.views.flow import optical_flow
 from mmsynth.operations.views.load import RIGS, Rig, load_views, on_the_rig
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.layouts.mmsdata import meta_content
 from mmsynth.scene.layouts.nerfstudio import transforms_content
 from mmsynth.scene.scene import PosedCamera, Scene, canonical_modality

@@ -1,4 +1,4 @@
-"""How good a field is: test views against the raw frames, and against the noise-free truth where a scene has it.
+"""Scores of a field: test views against the raw frames, and against noise-free truth where a scene has it.
 
 Definitions (all values linear, peak 1.0 = full scale, so PSNR = -10 log10 MSE; MSE is pooled over the pixels of all test views, not
 averaged per view in dB):
@@ -9,7 +9,7 @@ averaged per view in dB):
 * ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
   mosaic per channel.
 * ``psnr_truth``, ``psnr_truth_full``: all channels at every pixel of the own pose against ``gt/<modality>``, in the region and
-  everywhere; both clipped to [0, 1], beyond which no frame could have taught the field anything.
+  everywhere; both clipped to [0, 1], the range that frames can record.
 * ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
 * ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``dolp_rmse``; ``aolp_mae``:
   circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
@@ -138,7 +138,7 @@ def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering
 
 
 def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
-    """What PSNR does not say: the spectrum's shape, the polarization state."""
+    """Errors that PSNR does not show: the shape of the spectrum, the polarization."""
     where = where & rendering.valid
     if sensor.is_polarization:
         ours, real = (torch.from_numpy(s[where].astype(np.float64)) for s in (rendering.stokes[sensor.name], truth))

@@ -21,7 +21,8 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.files import sha256_of
 from mmsynth.operations.output.previews import preview_linear
-from mmsynth.scene.images import read_exr, read_native, read_npz, write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.image_writers import write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.images import read_exr, read_native, read_npz
 from mmsynth.scene.scene import Sensor
 from mmsynth.scene.serialisation import channels_to_json
 

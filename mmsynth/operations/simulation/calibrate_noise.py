@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from scipy.ndimage import gaussian_filter
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_atomic, write_json
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.images import read_native, used_bits
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
+from mmsynth.sensors.filters import gaussian_mean
 from mmsynth.sensors.mosaic import channel_map, crop_pattern, photosites_of
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.photon_transfer import UNCLIPPED, PhotonTransfer, photon_transfer_of_frames
@@ -256,7 +256,7 @@ def _blurred(raw: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     out = []
     for channel in range(int(pattern.max()) + 1):
         here = (measured == channel).astype(np.float64)
-        smooth = lambda image: gaussian_filter(image, (_BLUR * rows, _BLUR * columns), mode="nearest")
+        smooth = lambda image: gaussian_mean(image, (_BLUR * rows, _BLUR * columns))
         out.append(smooth(raw * here) / smooth(here))
     return np.stack(out, -1)
 

@@ -31,7 +31,7 @@ from mmsynth.operations.output.work_partition import WorkPartition
 from mmsynth.operations.simulation.frames import simulate_frame
 from mmsynth.operations.simulation.plan import SimulatedSensor, plan_sensor
 from mmsynth.operations.views.load import RIGS, Rig, load_views, views_of_frames
-from mmsynth.scene.images import write_dng, write_png, write_tiff
+from mmsynth.scene.image_writers import write_dng, write_png, write_tiff
 from mmsynth.scene.layouts.mmsdata import meta_content
 from mmsynth.scene.scene import PosedCamera, Scene
 from mmsynth.scene.serialisation import CONVENTIONS, posed_to_json

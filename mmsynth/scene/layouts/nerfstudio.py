@@ -31,6 +31,7 @@ from mmsynth.scene.scene import (
     OPENGL_TO_OPENCV,
     Frame,
     PosedCamera,
+    Region,
     Scene,
     Sensor,
     Split,
@@ -61,22 +62,12 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
     if not isinstance(meta, dict):
         raise InputError(f"{path}: a JSON {type(meta).__name__}, expected an object with the key 'frames'.")
     listed = objects(meta, "frames", path)
-    images = [_image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)]
-    present = [index for index, image in enumerate(images) if image is not None]
-    if not present:
-        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
-    problems = []
-    if len(present) < len(listed):
-        problems.append(f"{len(listed) - len(present)} of {len(listed)} frames have no image file and are left out.")
-    for source in dict.fromkeys(str(frame.get("modality", "")) for frame in listed):
-        if not any(str(listed[index].get("modality", "")) == source for index in present):
-            problems.append(f"{source or 'the default modality'}: none of its frames has an image file, it is left out.")
-
+    images = _images(root, listed, path)
+    problems = _missing(listed, images)
     first: dict[str, np.ndarray] = {}  # by modality as the file spells it: the first image, for size and channels
-    for index in present:
-        source = str(listed[index].get("modality", ""))
-        if source not in first:
-            first[source] = read_native(_known(images[index]))
+    for index, file in images.items():
+        if _source(listed[index]) not in first:
+            first[_source(listed[index])] = read_native(file)
     names = {source: canonical_modality(source) if source else _default_modality(image) for source, image in first.items()}
     wanted = wanted_modalities(dict.fromkeys(names.values()), modalities, path)
     described = _described(meta, path)
@@ -85,42 +76,86 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
         if names[source] in wanted and names[source] not in sensors:
             entry = described.get(names[source], {})
             sensors[names[source]] = make_sensor(names[source], entry, str(path), image, raw="mosaick_pattern" in entry)
+    sizes = {source: (image.shape[1], image.shape[0]) for source, image in first.items() if names[source] in sensors}
+    frames = _frames(meta, listed, images, names, sizes, path)
+    alpha = any(_has_alpha(first[source], sensors[names[source]]) for source in sizes)
+    region = _region(meta, root, sensors, frames, problems)
+    split = _split(meta, frames, path)
+    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
 
+
+def _source(frame: Mapping[str, Any]) -> str:
+    """Its modality as the file spells it; empty where it does not say."""
+    return str(frame.get("modality", ""))
+
+
+def _images(root: Path, listed: Sequence[Mapping[str, Any]], path: Path) -> dict[int, Path]:
+    """The image of each frame that has one, by the frame's position in the list."""
+    found = {index: _image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)}
+    images = {index: image for index, image in found.items() if image is not None}
+    if not images:
+        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
+    return images
+
+
+def _missing(listed: Sequence[Mapping[str, Any]], images: Mapping[int, Path]) -> list[str]:
+    """A sentence about frames, and one about each modality, without images."""
+    problems = []
+    if len(images) < len(listed):
+        problems.append(f"{len(listed) - len(images)} of {len(listed)} frames have no image file and are left out.")
+    there = {_source(listed[index]) for index in images}
+    for source in dict.fromkeys(map(_source, listed)):
+        if source not in there:
+            problems.append(f"{source or 'the default modality'}: none of its frames has an image file, it is left out.")
+    return problems
+
+
+def _frames(
+    meta: Mapping[str, Any],
+    listed: Sequence[Mapping[str, Any]],
+    images: Mapping[int, Path],
+    names: Mapping[str, str],
+    sizes: Mapping[str, tuple[int, int]],
+    path: Path,
+) -> list[Frame]:
+    """Frames with an image, of the modalities whose sizes are given, by sensor and view; every pose in the list is checked."""
     frames: list[Frame] = []
     positions: dict[str, int] = {}
-    for index, (frame, found) in enumerate(zip(listed, images, strict=True)):
-        source = str(frame.get("modality", ""))
+    for index, frame in enumerate(listed):
+        source = _source(frame)
         where = f"{path}: frame {index} ({frame['file_path']})"
         position = positions.get(source, 0)
         positions[source] = position + 1
         pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
-        if found is None or names[source] not in wanted:
+        if index not in images or source not in sizes:
             continue
-        camera = _camera(meta, frame, where, (first[source].shape[1], first[source].shape[0]))
+        camera = _camera(meta, frame, where, sizes[source])
         if camera is None:
             raise InputError(f"{where}: no focal length, expected 'fl_x' or 'camera_angle_x' in the frame or the file.")
         view = whole(frame, "view", where, 0, MAX_VIEW) if "view" in frame else position
-        mask = root / str(frame["mask_path"]) if "mask_path" in frame else None
-        frames.append(Frame(names[source], view, found, camera, pose, source, mask if mask is not None and is_file(mask) else None))
-    order = list(sensors)
+        mask = path.parent / str(frame["mask_path"]) if "mask_path" in frame else None
+        mask = mask if mask is not None and is_file(mask) else None
+        frames.append(Frame(names[source], view, images[index], camera, pose, source, mask))
+    order = list(dict.fromkeys(names[source] for source in sizes))
     frames.sort(key=lambda frame: (order.index(frame.sensor), frame.view))
     for one, two in itertools.pairwise(frames):
         if (one.sensor, one.view) == (two.sensor, two.view):
             raise InputError(f"{path}: view {one.view} of '{one.sensor}' is listed twice, expected every view once.")
-    alpha = any(_has_alpha(image, sensors[names[source]]) for source, image in first.items() if names[source] in sensors)
+    return frames
+
+
+def _region(meta: Mapping[str, Any], root: Path, sensors: Mapping[str, Sensor], frames: Sequence[Frame], problems: list[str]) -> Region:
+    """That of the cameras; smaller where the file's sparse points, or calibration boards in the pictures, say so."""
     region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
     stands = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
     if "ply_file_path" in meta:
         points = _sparse_points(root / str(meta["ply_file_path"]))
-        if points is None:
-            problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
-        else:
-            region = region_from_points(points, region, stands)
-    else:
-        plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
-        region = region_from_points(board_points(plain), region, stands) if plain else region
-    split = _split(meta, frames, path)
-    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
+        if points is not None:
+            return region_from_points(points, region, stands)
+        problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
+        return region
+    plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
+    return region_from_points(board_points(plain), region, stands) if plain else region
 
 
 def _sparse_points(path: Path) -> np.ndarray | None:
@@ -143,11 +178,6 @@ def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None
     # appended, not replaced: "0001.rgb" is a name without extension
     candidates = [path] if path.suffix.lower() in SUFFIXES else [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     return next((candidate for candidate in candidates if is_file(candidate)), None)
-
-
-def _known(path: Path | None) -> Path:
-    assert path is not None
-    return path
 
 
 def _default_modality(image: np.ndarray) -> str:

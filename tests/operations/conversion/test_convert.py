@@ -16,7 +16,8 @@ from mmsynth.errors import InputError
 from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.output.records import read_record
 from mmsynth.operations.views.coverage import coverage, training_rays
-from mmsynth.scene.images import read_image, write_png16
+from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.images import read_image
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.mosaic import mosaic
 from mmsynth.sensors.polarization import stokes_to_intensities

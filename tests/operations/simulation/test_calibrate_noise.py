@@ -15,7 +15,7 @@ from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.operations.simulation.calibrate_noise import by_modality, calibrate_from_frames, calibrate_noise, write
 from mmsynth.operations.simulation.simulate import simulate
-from mmsynth.scene.images import write_npz, write_png
+from mmsynth.scene.image_writers import write_npz, write_png
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
