@@ -213,7 +213,7 @@ def _exposed(raw: np.ndarray, expected: np.ndarray, pattern: np.ndarray, black: 
     that exposure. The exposure is the light of the brighter half in all, less what nobody expected.
 
     Of the ways to measure it (``guidance`` and ``register`` take medians) this one is the surest: of 16,000 photosites of a frame of 1/64
-    of the light it errs by 0.35 % (medians: 0.5 %), and by less than 0.01 % when a third of them show something else (medians: 0.4 to 0.9 %).
+    of the light it errs by 0.35 % (medians: 0.5 %), by less than 0.01 % when a third of them show something else (medians: 0.4 to 0.9 %).
     """
     everywhere = photosites_of(expected, pattern) - black
     good = np.isfinite(everywhere) & (raw < UNCLIPPED * white)
