@@ -219,6 +219,7 @@ def _refined(field: Field, raw: np.ndarray, camera: Camera, pose: np.ndarray, so
 
     def judged(light: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
         lit = light > 0.02
+        # plainly the median: where the guess is off and the light by 20 %, so is the exposure by 0.5 %; weighted by light, by 4 %
         exposure = float(np.median(seen[lit] / light[lit])) if lit.sum() > 16 else 1.0
         residual = (seen - exposure * light) * scale
         weight = 1.0 / np.maximum(1.0, np.abs(residual) / _HUBER)
