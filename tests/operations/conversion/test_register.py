@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.fitting.motions import motion_of, rigid
+from mmsynth.fitting.motions import matrix_to_motion, motion_to_matrix
 from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.register import Landmarks, landmarks, register
 from mmsynth.scene.image_writers import write_png16
@@ -62,12 +62,12 @@ def test_a_frame_is_found_to_a_fraction_of_a_pixel(field: Field, scene: Scene) -
     random = np.random.default_rng(0)
     known = landmarks(field, scene, "rgb")
     for exposure in (1.0, 0.5):
-        pose = ring_pose(1, 24) @ rigid(np.r_[random.normal(0, 0.05, 3), 0.02, -0.03, 0.25][None])[0]
+        pose = ring_pose(1, 24) @ motion_to_matrix(np.r_[random.normal(0, 0.05, 3), 0.02, -0.03, 0.25][None])[0]
         found = register(field, known, (exposure * _raw(field, pose, 99)).astype(np.float32), CAMERA, "rgb")
         points = 0.7 * np.array([[0.0, 0.0, 0.0], *np.eye(3), *-np.eye(3)])
         shown = [project((points - p[:3, 3]) @ p[:3, :3], CAMERA) for p in (pose, found.pose)]
         assert np.nanmax(np.linalg.norm(shown[0] - shown[1], axis=1)) < 0.2
-        off = motion_of((np.linalg.inv(pose) @ found.pose)[None])[0]
+        off = matrix_to_motion((np.linalg.inv(pose) @ found.pose)[None])[0]
         assert (np.abs(off) < 6 * np.sqrt(np.diag(found.covariance)) + 1e-5).all()
         assert found.sd_px < 0.1 and found.inliers > 50 and found.exposure == pytest.approx(exposure, rel=0.03)
 
@@ -104,7 +104,7 @@ def test_markers_tell_squares_that_look_alike_apart(tmp_path: Path) -> None:
         field, Scene(tmp_path, "test", field.sensors, tuple(frames), field.region, Split(tuple(range(6)), (), ""), "m"), "mono"
     )
     assert len(known.markers) > 40
-    pose = at(2.5) @ rigid(np.array([[0.02, -0.03, 0.4, 0.05, 0.0, 0.1]]))[0]
+    pose = at(2.5) @ motion_to_matrix(np.array([[0.02, -0.03, 0.4, 0.05, 0.0, 0.1]]))[0]
     found = register(field, Landmarks([], known.markers), shot(pose), camera, "mono")
     np.testing.assert_allclose(found.pose, pose, atol=2e-3)
     assert found.inliers > 40
