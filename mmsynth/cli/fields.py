@@ -26,7 +26,7 @@ from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
-    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.dataset.plan import DatasetFormat
     from mmsynth.operations.views.load import Rig
 
 

@@ -14,7 +14,7 @@ from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
     from mmsynth.operations.conversion.methods import Method
-    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.dataset.plan import DatasetFormat
     from mmsynth.operations.output.records import RecordFormat
     from mmsynth.operations.simulation.simulate import FrameFormat, Split
     from mmsynth.operations.views.load import Rig
@@ -195,7 +195,7 @@ def calibrate_noise(
     from mmsynth.workflows.runs import open_run
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
-    untold: dict[str, str] = {}
+    failed: dict[str, str] = {}
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
@@ -205,7 +205,9 @@ def calibrate_noise(
         folder, field, scene = opened.folder, opened.field, opened.scene
         known = noise.by_modality(files)
         with progress_bar("noise", as_json) as show:
-            found, untold = noise.calibrate_noise(field, scene, modality_names(modalities), known, raw, view_ids(views), progress=show)
+            found, failed = noise.calibrate_noise(
+                field, scene, modalities=modality_names(modalities), known=known, raw=raw, views=view_ids(views), progress=show
+            )
         destination = out or folder / "sensors"
     if found:
         noise.write(found, destination)
@@ -213,8 +215,8 @@ def calibrate_noise(
         print(json.dumps(facts) if as_json else noise_text(found))
         if not as_json:
             print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
-    if untold:
-        raise InputError(" ".join(untold.values()))
+    if failed:
+        raise InputError(" ".join(failed.values()))
 
 
 @command("mesh")

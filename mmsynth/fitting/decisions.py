@@ -81,7 +81,7 @@ def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measureme
     usable = batch.target < batch.saturation
     for name, (_, own) in batch.parts.items():
         m, kept = measurements[name], usable[own]
-        of_modality = predicted[own][kept] / m.level, batch.target[own][kept] / m.level, batch.frame[own][kept] - begin
+        of_modality = predicted[own][kept] / m.radiance_scale, batch.target[own][kept] / m.radiance_scale, batch.frame[own][kept] - begin
         frames = len(m.origins)
         spread, noise = exposure_spread(Residuals(*(x.cpu().numpy() for x in of_modality)), frames)
         begin += frames

@@ -57,6 +57,9 @@ class Measurements:
     """All training pixels of one modality.
 
     Integer images stay integers (8 or 16 bit), so a scene takes the memory of its files, decoded, and no more.
+
+    Attributes:
+        radiance_scale: the mean of its values, by which residuals are compared with those of other modalities.
     """
 
     def __init__(self, sensor: Sensor, frames: tuple[Frame, ...], region: Region) -> None:
@@ -88,7 +91,7 @@ class Measurements:
         self.ends = np.cumsum(self.counts)
         self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
         drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
-        self.level = float(self.read(drawn, pixel)[0].mean())
+        self.radiance_scale = float(self.read(drawn, pixel)[0].mean())
 
     def set_poses(self, poses: np.ndarray) -> None:
         """Let the frames be at (F, 4, 4) camera_to_world, normalised frame."""
@@ -189,7 +192,7 @@ def draw(
         parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + count * values)
         r_end += count
         m_end += count * values
-        numbers.append((count * values, m.level, m.sensor.saturation, 1.0 / (len(order) * count * values)))
+        numbers.append((count * values, m.radiance_scale, m.sensor.saturation, 1.0 / (len(order) * count * values)))
     lengths = [n[0] for n in numbers]
     joined = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in lists.items() if v}
     level, saturation, weight = (
@@ -211,7 +214,7 @@ def load_measurements(scene: Scene) -> dict[str, Measurements]:
         if not frames:
             continue
         out[name] = Measurements(sensor, frames, scene.region)
-        if not out[name].level > 0:
+        if not out[name].radiance_scale > 0:
             raise InputError(f"{frames[0].path.parent}: all training frames of {name} are black, expected some light.")
     if not out:
         raise InputError(f"{scene.root}: no modality has a training frame.")

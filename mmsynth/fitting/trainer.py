@@ -77,7 +77,7 @@ class Trainer:
         self.measurements: dict[str, Measurements] = load_measurements(scene)
         self.needs: Needs = assess(scene, self.measurements, recipe, seed, expected_rays(recipe, steps, budget))
         sensors = {n: m.sensor for n, m in self.measurements.items()}
-        radiance_scale = {n: m.level for n, m in self.measurements.items()}
+        radiance_scale = {n: m.radiance_scale for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
         self.field = Field(self.needs.design, sensors, radiance_scale, scene.region, scene.unit, cameras, rig_of(scene)).to(self.device)
         frames = sum(len(m.origins) for m in self.measurements.values())

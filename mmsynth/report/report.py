@@ -126,10 +126,10 @@ def _source(image: np.ndarray) -> str:
 
 
 def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
-    """A frame with all channels at every pixel (H, W, C), demosaicked for display; what is transparent is black, as for the scores."""
+    """A frame with all channels at every pixel (H, W, C), demosaicked for display; times its alpha, as it is fitted and scored."""
     pixels, alpha = load_frame(sensor, frame)
     if alpha is not None:
-        return pixels * alpha[..., None]
+        pixels = pixels * alpha[..., None]
     if sensor.mosaic is not None and is_bayer(sensor.mosaic):
         return np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
     return channels_of(pixels, sensor.mosaic)

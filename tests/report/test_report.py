@@ -70,10 +70,12 @@ def test_previews_of_a_mosaic_show_every_channel_in_its_place(tmp_path: Path, pa
         np.testing.assert_allclose(shown, theirs, atol=1e-5)
 
 
-def test_previews_show_what_is_transparent_as_black(tmp_path: Path) -> None:
-    rgba = np.full((4, 6, 4), 200, np.uint8)
-    rgba[:, 3:, 3] = 0
-    cv2.imwrite(str(tmp_path / "0.png"), rgba)
-    sensor = Sensor("rgb", tuple("RGB"), (None,) * 3)
-    shown = measured_channels(sensor, Frame("rgb", 0, tmp_path / "0.png", Camera(6, 4, 5.0, 5.0, 2.5, 1.5), np.eye(4)))
-    assert (shown[:, :3] > 0.1).all() and (shown[:, 3:] == 0).all()
+def test_previews_of_frames_with_alpha_show_what_is_scored(tmp_path: Path) -> None:
+    """Colours behind transparent pixels are of nothing that was seen."""
+    rgba = np.random.default_rng(0).random((20, 30, 4)).astype(np.float32)
+    rgba[:10, :, 3] = 0.0
+    cv2.imwrite(str(tmp_path / "0.png"), np.round(65535 * rgba[..., [2, 1, 0, 3]]).astype(np.uint16))
+    frame = Frame("rgb", 0, tmp_path / "0.png", Camera(30, 20, 20.0, 20.0, 15.0, 10.0), np.eye(4))
+    shown = measured_channels(Sensor("rgb", ("R", "G", "B"), (None, None, None)), frame)
+    np.testing.assert_allclose(shown, rgba[..., :3] * rgba[..., 3:], atol=2e-5)
+    assert not shown[:10].any()
