@@ -1,4 +1,4 @@
-"""Motions of cameras, from what the residuals of rays say about them.
+"""Pose corrections of views and sensors by Gauss-Newton steps on the residuals of rays.
 
 A motion is six numbers: a rotation vector (radians) and a translation (normalised frame), in a camera's own axes, about its own
 centre. Every view has one, which all its sensors follow; it is that of the view's *anchor*, its frame of the first sensor.

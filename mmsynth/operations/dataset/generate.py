@@ -119,7 +119,7 @@ def generate_dataset(
         raise InputError("dataset: coverage needs the rays of the training frames, expected the scene.")
     left_out: list[tuple[str, float]] = []
     if min_coverage is not None and rays is not None:
-        views, left_out = covered_views(views, view_scores(field, rays, views, progress), min_coverage)
+        views, left_out = covered_views(views, view_scores(field, rays, views, progress=progress), min_coverage)
     plan = plan_dataset(field, views, Path(out), names, rig, file_format, wanted, rays)
     part = part or WorkPartition()
     _write_views(plan, part, progress)
