@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
+from mmsynth.field.kernels import Measured
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
@@ -45,6 +46,11 @@ class Batch:
     frame: Tensor
     parts: dict[str, tuple[slice, slice]]
     alpha: Tensor
+
+    @property
+    def measured(self) -> Measured:
+        """The numbers, as the kernels take them."""
+        return Measured(self.target, self.ray, self.output, self.axes, self.level, self.saturation, self.weight)
 
 
 class Measurements:

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting import losses
 from mmsynth.fitting.measurements import Batch
 from mmsynth.fitting.optimiser import Adam
 
@@ -52,10 +52,10 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
         optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
         for step in range(_STEPS + 1):
             with torch.enable_grad():
-                predicted = losses.predict(pupil(features, batch.directions, degree), opacity, batch)
-                difference = losses.residual(predicted, batch)
+                predicted = kernels.predict(pupil(features, batch.directions, degree), opacity, batch.measured)
+                difference = kernels.residual(predicted, batch.measured)
                 if step < _STEPS:
-                    losses.photometric(difference * learned, batch).backward()
+                    kernels.photometric(difference * learned, batch.measured).backward()
                     optimiser.step(1.0 - step / _STEPS)
         for name, (_, numbers) in batch.parts.items():
             judged = (~learned & usable)[numbers]

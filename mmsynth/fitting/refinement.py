@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Corrections, Field
-from mmsynth.fitting import losses
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.measurements import Batch, Measurements, in_order
 from mmsynth.fitting.motions import Equations, Motions, Rows
@@ -27,7 +26,7 @@ _PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
 See = Callable[[dict[str, int], np.random.Generator], Rows]
 
 
-def see(field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, beyond: bool, sampling: rendering.Sampling) -> Rows:
+def see(field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, beyond: bool, sampling: kernels.Sampling) -> Rows:
     """Residuals of rays, the mean over the numbers measured along each, in units of the modality's level, and their derivatives.
 
     Args:
@@ -40,8 +39,8 @@ def see(field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, beyond
     with torch.enable_grad():
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
         features, opacity = field.with_far_light(hits) if beyond else (hits.features, hits.opacity)
-        predicted = losses.predict(field.shader(features, directions, degrees), opacity, batch)
-        relative = losses.residual(predicted if gain is None else predicted * gain, batch) / batch.level
+        predicted = kernels.predict(field.shader(features, directions, degrees), opacity, batch.measured)
+        relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.level
         mean = torch.zeros_like(middle).index_add(0, batch.ray, relative) / torch.bincount(batch.ray, minlength=len(origins))
         gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
     field.requires_grad_(True)

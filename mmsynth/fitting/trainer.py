@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from mmsynth.errors import DivergedError, InputError
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
 from mmsynth.fitting import losses, probe
 from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
@@ -164,7 +164,7 @@ class Trainer:
         state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
         state.step += 1
 
-    def _loss(self, batch: Batch, sampling: rendering.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
+    def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
         recipe, field = self.recipe, self.field
         origins, directions = batch.origins, batch.directions
         jitter = torch.rand(len(origins), generator=generator).to(self.device)
@@ -195,7 +195,7 @@ class Trainer:
         """Exposure of each number's frame, (M,); None where no gains were needed."""
         return self._gain()[batch.frame] if self.state.decided and self.state.decided["exposure"] else None
 
-    def _see(self, sampling: rendering.Sampling, rays: dict[str, int], random: np.random.Generator) -> Rows:
+    def _see(self, sampling: kernels.Sampling, rays: dict[str, int], random: np.random.Generator) -> Rows:
         batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
         beyond = self.state.decided is not None
         return see(self.field, batch, self._per_ray(batch, self.field.view_dependence), self._gain_of(batch), beyond, sampling)
@@ -205,7 +205,7 @@ class Trainer:
         counts = [rays.stop - rays.start for rays, _ in batch.parts.values()]
         return torch.from_numpy(np.repeat([values[n] for n in batch.parts], counts)).to(self.device)
 
-    def _size_tables(self, sampling: rendering.Sampling, generator: torch.Generator) -> None:
+    def _size_tables(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
         """Give the levels of the hash tables that are not yet active rows for the cells at the surface, as it is now."""
         recipe, design = self.recipe, self.needs.design
         cells = cells_at_surface(self.field, sampling.active_surface, generator)
@@ -232,7 +232,7 @@ class Trainer:
         self.needs.evidence["tables"] = sizes["evidence"]
 
     @torch.no_grad()
-    def _decide(self, sampling: rendering.Sampling) -> None:
+    def _decide(self, sampling: kernels.Sampling) -> None:
         """Put the residuals of this moment to the tests of ``probe``, and switch on what they ask for."""
         recipe, field = self.recipe, self.field
         random = np.random.default_rng((self.seed, 2))
@@ -240,7 +240,7 @@ class Trainer:
         jitter = torch.full((len(batch.origins),), 0.5, device=self.device)
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
         outputs = field.shader(hits.features, batch.directions, self._per_ray(batch, field.view_dependence))
-        predicted = losses.predict(outputs, hits.opacity, batch)
+        predicted = kernels.predict(outputs, hits.opacity, batch.measured)
         evidence = self.needs.evidence
         degrees, spreads, begin = {}, {}, 0
         usable = batch.target < batch.saturation
@@ -271,10 +271,10 @@ class Trainer:
 
     def _gradients(
         self,
-        hits: rendering.Hits,
+        hits: kernels.Hits,
         origins: torch.Tensor,
         directions: torch.Tensor,
-        sampling: rendering.Sampling,
+        sampling: kernels.Sampling,
         generator: torch.Generator,
     ) -> torch.Tensor:
         """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""

@@ -15,7 +15,8 @@ from torch.nn.functional import normalize, softplus
 
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
-from mmsynth.field.radiance import Shader, intensity, radiance
+from mmsynth.field.kernels import intensity, radiance
+from mmsynth.field.radiance import Shader
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
@@ -91,7 +92,7 @@ def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
     field = _field(True, Region((10.0, 0.0, -5.0), 3.0))
     x = np.array([[10.0, 0.0, -5.0], [10.0, 1.8, -5.0], [10.0, 0.0, 25.0], [-300.0, 200.0, 0.0]])
     unit = torch.from_numpy((x - [10.0, 0.0, -5.0]) / 3.0)
-    expected = 3.0 * field.double().surface.reference(kernels.contract(unit), 2)
+    expected = 3.0 * kernels.surface_value(kernels.contract(unit), *field.double().surface.at(2))
     np.testing.assert_allclose(field.float().sdf(x), expected.detach().numpy(), atol=1e-5)
     assert field.sdf(np.empty((0, 3))).shape == (0,)
 
