@@ -1,74 +1,80 @@
 """mmsynth: one radiance field of a scene from the raw frames of several sensors, and what no rig could capture from it.
 
-The names below are loaded when first used, so that ``mmsynth --help`` does not wait for torch.
+What a command does is one call:
+
+* ``mmsynth info``: ``load_scene`` → ``Scene``: sensors, frames with cameras and poses, split, problems.
+* ``mmsynth fit``: ``fit_run`` → ``Run``: a fit with its report and ``runs/latest``. ``fit``: the field alone.
+* ``mmsynth evaluate``: ``evaluate_run(open_run())``, ``evaluate_conversions``. ``evaluate``: the scores alone.
+* ``mmsynth convert``: ``convert_files``. ``convert``: tensors in, tensors out.
+* ``mmsynth generate-dataset``: ``generate_dataset``, ``verify_dataset``. ``AlignedDataset`` reads one for training.
+* ``mmsynth simulate``: ``simulate``. ``SensorTwin``: the effects of one sensor on tensors.
+* ``mmsynth calibrate-noise``: ``calibrate_noise``.
+* ``mmsynth mesh``: ``mesh_to_file``. ``extract_mesh`` and ``write_mesh``: in memory, then to a file.
+* ``mmsynth batch``: ``run_batch``.
+
+A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. A ``Recipe`` holds every number of a fit. Bad input raises
+``InputError``, a fit that diverged ``DivergedError``, with one sentence each. Names are loaded when first used, so that ``mmsynth --help``
+does not wait for torch.
 """
 
 from __future__ import annotations
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
 from mmsynth.version import __version__ as __version__
-
-# OpenMP's threads spin for milliseconds at every barrier by default, which stalls a fit beside another busy process.
-# A short spin costs nothing alone and was 1.6 times as fast beside one. Read when torch is loaded; a user's own setting stays.
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 if TYPE_CHECKING:
     from mmsynth.errors import DivergedError, InputError
     from mmsynth.field.field import Field, Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
     from mmsynth.fitting.run import fit
+    from mmsynth.operations.conversion.files import convert_files
     from mmsynth.operations.conversion.methods import convert
     from mmsynth.operations.dataset.aligned import AlignedDataset
     from mmsynth.operations.dataset.generate import generate_dataset
+    from mmsynth.operations.dataset.index import verify_dataset
+    from mmsynth.operations.evaluation.conversions import evaluate_conversions
     from mmsynth.operations.evaluation.evaluate import evaluate
-    from mmsynth.operations.mesh.extract import extract_mesh
+    from mmsynth.operations.mesh.extract import extract_mesh, mesh_to_file
     from mmsynth.operations.mesh.files import write_mesh
     from mmsynth.operations.simulation.calibrate_noise import calibrate_noise
     from mmsynth.operations.simulation.simulate import simulate
     from mmsynth.scene.load import load_scene
     from mmsynth.sensors.twin import SensorTwin
+    from mmsynth.workflows.batch import run_batch
+    from mmsynth.workflows.fit import evaluate_run, fit_run
+    from mmsynth.workflows.runs import Run, open_run
 
-_HOMES = {
-    "AlignedDataset": "operations.dataset.aligned",
-    "DivergedError": "errors",
-    "InputError": "errors",
-    "Field": "field.field",
-    "Rendering": "field.field",
-    "SensorTwin": "sensors.twin",
-    "calibrate_noise": "operations.simulation.calibrate_noise",
-    "Recipe": "fitting.recipe",
-    "load_recipe": "fitting.recipe",
-    "fit": "fitting.run",
-    "convert": "operations.conversion.methods",
-    "generate_dataset": "operations.dataset.generate",
-    "evaluate": "operations.evaluation.evaluate",
-    "extract_mesh": "operations.mesh.extract",
-    "write_mesh": "operations.mesh.files",
-    "load_scene": "scene.load",
-    "simulate": "operations.simulation.simulate",
+_NAMES = {
+    "errors": "DivergedError InputError",
+    "field.field": "Field Rendering",
+    "fitting.recipe": "Recipe load_recipe",
+    "fitting.run": "fit",
+    "operations.conversion.files": "convert_files",
+    "operations.conversion.methods": "convert",
+    "operations.dataset.aligned": "AlignedDataset",
+    "operations.dataset.generate": "generate_dataset",
+    "operations.dataset.index": "verify_dataset",
+    "operations.evaluation.conversions": "evaluate_conversions",
+    "operations.evaluation.evaluate": "evaluate",
+    "operations.mesh.extract": "extract_mesh mesh_to_file",
+    "operations.mesh.files": "write_mesh",
+    "operations.simulation.calibrate_noise": "calibrate_noise",
+    "operations.simulation.simulate": "simulate",
+    "scene.load": "load_scene",
+    "sensors.twin": "SensorTwin",
+    "workflows.batch": "run_batch",
+    "workflows.fit": "evaluate_run fit_run",
+    "workflows.runs": "Run open_run",
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
 __all__ = [
-    "AlignedDataset",
-    "DivergedError",
-    "Field",
-    "InputError",
-    "Recipe",
-    "Rendering",
-    "SensorTwin",
-    "calibrate_noise",
-    "convert",
-    "evaluate",
-    "extract_mesh",
-    "fit",
-    "generate_dataset",
-    "load_recipe",
-    "load_scene",
-    "simulate",
-    "write_mesh",
-]
+    "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise", "convert",
+    "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "extract_mesh", "fit", "fit_run", "generate_dataset",
+    "load_recipe", "load_scene", "mesh_to_file", "open_run", "run_batch", "simulate", "verify_dataset", "write_mesh",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

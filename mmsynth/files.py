@@ -61,6 +61,8 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: not valid JSON at line {error.lineno}, column {error.colno} ({error.msg}).") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text at byte {error.start}.") from error
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, lists in lists without end
+        raise InputError(f"{path}: JSON that cannot be read ({str(error).split(';')[0].split(': ')[0]}).") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
 

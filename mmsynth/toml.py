@@ -23,10 +23,10 @@ def read_toml(path: Path, model: type[Model]) -> Model:
         return model.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror}).") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML ({error}).") from error
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}.") from error
+    except (ValueError, RecursionError) as error:  # broken TOML, no UTF-8, a number of thousands of digits, lists in lists without end
+        raise InputError(f"{path}: not valid TOML ({error}).") from error
 
 
 def first_problem(error: ValidationError) -> str:

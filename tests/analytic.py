@@ -11,7 +11,7 @@ import torch
 from conftest import look_at
 
 from mmsynth.field.field import Field, Rendering
-from mmsynth.scene.images import write_npz, write_png16
+from mmsynth.scene.image_writers import write_npz, write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.mosaic import mosaic

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.scene import PosedCamera
+from mmsynth.sensors.camera import Camera
 
 WIDTH, HEIGHT = 24, 18
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -31,6 +33,10 @@ def ring(count: int, radius: float = 3.0, height: float = 1.0) -> list[np.ndarra
     """Poses on a ring, looking at the origin."""
     angles = 2 * np.pi * np.arange(count) / count
     return [look_at((radius * np.cos(a), radius * np.sin(a), height)) for a in angles]
+
+
+def unpacked(views: Iterable[PosedCamera]) -> list[tuple[Camera, np.ndarray, str]]:
+    return [(view.camera, view.camera_to_world, view.name) for view in views]
 
 
 def frame_values(view: int, channels: int = 0) -> np.ndarray:

@@ -8,7 +8,7 @@ A table is a TOML file of variants, the first of which is the baseline and chang
     [[variant]]
     name = "coarse"
     why = "one line: what the change should tell"
-    recipe = { radiance_cells = 1.0 }    # keys of the recipe
+    recipe = { radiance.cells_per_pixel = 0.5 }    # keys of the recipe, by section
     modalities = ["rgb", "ms"]           # fit these alone; left out: all
     frames = { pol = 3 }                 # training frames to keep
 """
@@ -43,7 +43,7 @@ class Variant(BaseModel):
 
     name: str = Field(pattern=r"^[\w.+-]+$")
     why: str = ""
-    recipe: dict[str, Any] = {}
+    recipe: dict[str, dict[str, Any]] = {}
     modalities: list[str] | None = None
     frames: dict[str, int] = {}
 
@@ -51,7 +51,8 @@ class Variant(BaseModel):
     def changes(self) -> dict[str, Any]:
         """What it changes, by name."""
         given = {"modalities": self.modalities, "frames": self.frames}
-        return self.recipe | {key: value for key, value in given.items() if value}
+        recipe = {f"{section}.{key}": value for section, keys in self.recipe.items() for key, value in keys.items()}
+        return recipe | {key: value for key, value in given.items() if value}
 
     def fitted_recipe(self) -> Recipe:
         """The default recipe with the changes."""

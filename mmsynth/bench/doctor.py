@@ -1,4 +1,4 @@
-"""Is this machine ready: versions, threads, GPU, compiled kernels, and what to do about it."""
+"""The state of this machine: versions, threads, GPU, compiled kernels, and advice."""
 
 from __future__ import annotations
 

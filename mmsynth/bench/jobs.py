@@ -1,8 +1,8 @@
 """Fits to be measured, each in a process of its own, each result on disk as soon as it is there.
 
 A result lies in ``OUT/rows/<name>-<digest>.json``, and the digest is that of everything the result depends on (``identity``): pixels,
-poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result that is there is the result, and a
-bench that was killed goes on where it was.
+poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result on disk is never out of date, and a
+benchmark that was interrupted continues where it was.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-import mmsynth
 from mmsynth.bench.machine import identify
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.files import read_json, write_json
@@ -29,7 +28,7 @@ from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene, keep_frames
 
-_PACKAGE = Path(mmsynth.__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 # what a fit and its score run through
 _CODE = ("field", "fitting", "scene", "sensors", "operations/evaluation", "bench/worker.py")
 
@@ -65,7 +64,7 @@ def scene_of(task: Mapping[str, Any]) -> Scene:
     Raises:
         InputError: no such scene, modality or number of frames.
     """
-    return keep_frames(load_scene(Path(task["scene"]), task["modalities"]), task["frames"])
+    return keep_frames(load_scene(Path(task["scene"]), modalities=task["modalities"]), task["frames"])
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -> Iterator[dict[str, Any]]:

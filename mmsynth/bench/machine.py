@@ -1,4 +1,4 @@
-"""The machine that a number was measured on: what it is, and its two limits measured beside the number."""
+"""The machine that a figure was measured on: what it is, and its memory bandwidth and arithmetic speed, measured beside the figure."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def work(task: Mapping[str, Any], _: Path) -> dict[str, Any]:
         InputError: no such run, scene or reference, or nothing to mesh.
     """
     field = Field.load(Path(task["run"]))
-    scene = load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))
+    scene = load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors))
     reference = None if task["against"] is None else load_reference(Path(task["against"]))
     began, cpu = time.perf_counter(), time.process_time()
     mesh = METHODS[task["method"]](field, scene, task["resolution"])

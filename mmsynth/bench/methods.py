@@ -22,6 +22,10 @@ from mmsynth.operations.output.progress import Progress
 REPEATS = 7
 
 
+Family = Callable[..., list[Any]]
+"""A function whose name and docstring are those of a table, and which makes its methods."""
+
+
 @dataclass(frozen=True)
 class Method:
     """One way to compute something.
@@ -40,10 +44,8 @@ class Method:
     unit: str
 
 
-def measured(
-    families: Sequence[Callable[[], list[Method]]], bench: str, only: Sequence[str] | None, repeats: int, progress: Progress | None
-) -> list[dict[str, Any]]:
-    """Run all families, or those whose functions are named in ``only``; one row per method.
+def chosen_families(families: Sequence[Family], bench: str, only: Sequence[str] | None) -> dict[str, Family]:
+    """Families by name: all, or those named in ``only``.
 
     Raises:
         InputError: an unknown name.
@@ -52,7 +54,7 @@ def measured(
     for name in only or ():
         if name not in known:
             raise InputError(f"bench {bench}: no family {name!r}, expected some of {', '.join(known)}.")
-    return measured_methods([m for name, family in known.items() if only is None or name in only for m in family()], repeats, progress)
+    return {name: family for name, family in known.items() if only is None or name in only}
 
 
 def measured_methods(methods: Sequence[Method], repeats: int, progress: Progress | None, threads: int = 1) -> list[dict[str, Any]]:
@@ -108,7 +110,7 @@ def typical(error: np.ndarray) -> dict[str, float]:
 def family_tables(
     rows: Sequence[Mapping[str, Any]],
     columns: Sequence[Column],
-    families: Sequence[Callable[..., Any]],
+    families: Sequence[Family],
     more: Mapping[str, str] | None = None,
 ) -> list[Table]:
     """A table per family that has rows; its note is the first line of its function's docstring, and what ``more`` adds."""

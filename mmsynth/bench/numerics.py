@@ -16,12 +16,11 @@ import cv2
 import kornia
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from mmsynth.bench.machine import measure
-from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, typical
-from mmsynth.bench.output import Report, new_figure, write_report
+from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_tables, measured_methods, typical
+from mmsynth.bench.output import Report, scatter_panels, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.field.kernels import reference
 from mmsynth.operations.output.progress import Progress
@@ -285,9 +284,11 @@ def bench_numerics(out: Path, only: Sequence[str] | None = None, repeats: int = 
     Raises:
         InputError: an unknown name, or ``out`` cannot be written.
     """
-    rows = measured(FAMILIES, "numerics", only, repeats, progress)
+    families = chosen_families(FAMILIES, "numerics", only)
+    rows = measured_methods([m for family in families.values() for m in family()], repeats, progress)
+    figure = scatter_panels(rows, ("ns", "ns per element"), ("worst", "worst error [{unit}]"), "{method}", ours="mmsynth")
     results = {"bench": "numerics", "machine": measure(), "rows": rows, "repeats": repeats}
-    return write_report(results, tables_of(rows), plot(rows), out)
+    return write_report(results, tables_of(rows), figure, out)
 
 
 def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
@@ -304,24 +305,3 @@ def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         Column("PSNR [dB]", "psnr", ".2f"),
     )
     return family_tables(rows, columns, FAMILIES, {"undistortion": " Error: the median. Wrong: by more than 0.1 px, or behind the fold."})
-
-
-def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Error over ns per element, both log, a panel per family; ours filled."""
-    families = list(dict.fromkeys(row["family"] for row in rows))
-    figure, axes = new_figure(len(families))
-    for one, family in zip(axes, families, strict=True):
-        here = [row for row in rows if row["family"] == family]
-        for i, method in enumerate(dict.fromkeys(row["method"] for row in here)):
-            points = [
-                (row["ns"], max(row["worst"], 1e-16))
-                for row in here
-                if row["method"] == method and math.isfinite(row.get("worst", math.inf))
-            ]
-            if points:
-                face = f"C{i % 10}" if "mmsynth" in method else "none"
-                x, y = zip(*points, strict=True)
-                one.scatter(x, y, s=24, facecolors=face, edgecolors=f"C{i % 10}", label=method)
-        one.set(xscale="log", yscale="log", xlabel="ns per element", ylabel=f"worst error [{here[0]['unit']}]", title=family)
-        one.legend(frameon=False, fontsize=7)
-    return figure

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,3 +50,26 @@ def new_figure(panels: int, height: float = 4.2) -> tuple[Figure, list[Axes]]:
     for one in axes:
         one.grid(alpha=0.25)
     return figure, axes
+
+
+def scatter_panels(rows: Sequence[Mapping[str, Any]], x: tuple[str, str], y: tuple[str, str], label: str, ours: str = "") -> Figure:
+    """Error over speed, both log, a panel per family of methods.
+
+    Args:
+        x, y: key of a row and label of the axis, which may name other keys in braces; rows without a finite y are left out.
+        label: of a point, from the keys of its row; those of one label have one colour. ours: methods with it in their name are filled,
+            with "" all.
+    """
+    rows = [row for row in rows if math.isfinite(row.get(y[0], math.inf))]
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    figure, axes = new_figure(len(families))
+    for one, family in zip(axes, families, strict=True):
+        here = [row for row in rows if row["family"] == family]
+        for i, name in enumerate(dict.fromkeys(label.format_map(row) for row in here)):
+            points = [row for row in here if label.format_map(row) == name]
+            face = f"C{i % 10}" if ours in points[0]["method"] else "none"
+            values = [max(row[y[0]], 1e-16) for row in points]
+            one.scatter([row[x[0]] for row in points], values, s=24, facecolors=face, edgecolors=f"C{i % 10}", label=name)
+        one.set(xscale="log", yscale="log", xlabel=x[1], ylabel=y[1].format_map(here[0]), title=family)
+        one.legend(frameon=False, fontsize=7)
+    return figure

@@ -19,12 +19,11 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from mmsynth.bench.machine import measure, use_threads
-from mmsynth.bench.methods import Method, family_tables, measured_methods
-from mmsynth.bench.output import Report, new_figure, write_report
+from mmsynth.bench.methods import Method, chosen_families, family_tables, measured_methods
+from mmsynth.bench.output import Report, scatter_panels, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
@@ -292,16 +291,12 @@ def bench_render(
     Raises:
         InputError: an unknown name, a scene without frames, more threads than numba was started with, or ``out`` cannot be written.
     """
-    known = {family.__name__: family for family in FAMILIES}
-    for name in only or ():
-        if name not in known:
-            raise InputError(f"bench render: no family {name!r}, expected some of {', '.join(known)}.")
+    families = chosen_families(FAMILIES, "render", only)
     with use_threads(threads):
         machine = measure()
         rays = rays_of(field, scene)
         bed = Bed(field, rays, truth_of(field, rays))
-        chosen = {name: family(bed) for name, family in known.items() if only is None or name in only}
-        methods = [_method(bed, name, way) for name, ways in chosen.items() for way in ways]
+        methods = [_method(bed, name, way) for name, family in families.items() for way in family(bed)]
         rows = measured_methods(methods, repeats, progress, torch.get_num_threads())
     for row in rows:
         row["rays_per_s"] = 1e9 / row["ns"]
@@ -314,7 +309,8 @@ def bench_render(
         "sampling": field.sampling._asdict(),
         "reference": fine(field.sampling)._asdict() | {"samples": bed.truth.samples, "doubt": bed.truth.doubt},
     }
-    return write_report(results, tables_of(results), plot(results), out)
+    figure = scatter_panels(rows, ("rays_per_s", "rays/s"), ("error", "error of radiance [full scale]"), "{problem}: {method}")
+    return write_report(results, tables_of(results), figure, out)
 
 
 def _method(bed: Bed, family: str, way: Way) -> Method:
@@ -345,23 +341,3 @@ def tables_of(results: Mapping[str, Any]) -> list[Table]:
         "relative. Missed: rays of which one met the surface and one did not."
     )
     return family_tables(rows, columns, FAMILIES, {family.__name__: note for family in FAMILIES})
-
-
-def plot(results: Mapping[str, Any]) -> Figure:
-    """Error over rays per second, both log, a panel per family."""
-    rows = [row for row in results["rows"] if "error" in row]
-    families = list(dict.fromkeys(row["family"] for row in rows))
-    figure, axes = new_figure(len(families))
-    for one, family in zip(axes, families, strict=True):
-        here = [row for row in rows if row["family"] == family]
-        markers = dict(zip(dict.fromkeys(row["problem"] for row in here), "os^v", strict=False))
-        colours = {name: f"C{i % 10}" for i, name in enumerate(dict.fromkeys(row["method"] for row in here))}
-        for row in here:
-            label = f"{row['problem']}: {row['method']}"
-            one.scatter(
-                row["rays_per_s"], max(row["error"], 1e-9), s=24, color=colours[row["method"]], marker=markers[row["problem"]], label=label
-            )
-        one.axhline(max(results["reference"]["doubt"], 1e-9), color="0.5", linewidth=0.8, linestyle="--")
-        one.set(xscale="log", yscale="log", xlabel="rays per second", ylabel="error [full scale]", title=family)
-        one.legend(frameon=False, fontsize=6)
-    return figure

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from mmsynth.bench.machine import measure
-from mmsynth.bench.methods import REPEATS, Method, family_tables, measured, measured_methods, typical
-from mmsynth.bench.output import Report, new_figure, write_report
+from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_tables, measured_methods, typical
+from mmsynth.bench.output import Report, scatter_panels, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.operations.output.progress import Progress
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera, resized
 from mmsynth.sensors.noise import NoiseModel, record
 from mmsynth.sensors.photon_transfer import photon_transfer, photon_transfer_of_frames
@@ -157,7 +157,8 @@ def _star(camera: Camera) -> Tensor:
 
 def of_the_field(field: Field) -> list[Method]:
     """The first sensor of a fitted field, rays per pixel along each axis, against 8 x 8."""
-    from mmsynth.operations.simulation.simulate import Simulated, render_light
+    from mmsynth.operations.simulation.frames import render_light
+    from mmsynth.operations.simulation.plan import SimulatedSensor
 
     name = next(iter(field.sensors))
     camera = field.cameras[name]
@@ -167,8 +168,9 @@ def of_the_field(field: Field) -> list[Method]:
     file = SensorFile.model_validate({"name": name, "instance_of": name, "noise": _PLAIN})
 
     def light(s: int) -> Tensor:
-        planned = Simulated(file, field.sensors[name], camera, np.eye(4), (name,), s, False, lambda c, _: np.moveaxis(c[name], -1, 0), {})
-        return render_light(field, planned, camera, pose)
+        own_light = lambda c, _: np.moveaxis(c[name], -1, 0)
+        planned = SimulatedSensor(file, field.sensors[name], camera, np.eye(4), (name,), s, False, own_light, {})
+        return render_light(field, planned, PosedCamera(camera, pose))
 
     truth = light(8)
 
@@ -279,11 +281,13 @@ def bench_twin(
     Raises:
         InputError: an unknown name, or ``out`` cannot be written.
     """
-    rows = measured(FAMILIES, "twin", only, repeats, progress)
+    families = chosen_families(FAMILIES, "twin", only)
+    rows = measured_methods([m for family in families.values() for m in family()], repeats, progress)
     if field is not None:
         rows += measured_methods(of_the_field(field), min(repeats, 3), progress)
+    figure = scatter_panels(rows, ("ns", "ns per element"), ("error", "error [{unit}]"), "{problem}: {method}")
     results = {"bench": "twin", "machine": measure(), "rows": rows, "repeats": repeats}
-    return write_report(results, tables_of(rows), plot(rows), out)
+    return write_report(results, tables_of(rows), figure, out)
 
 
 def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
@@ -306,16 +310,3 @@ def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         Column("in", "unit"),
     )
     return family_tables(rows, columns, (*FAMILIES, of_the_field))
-
-
-def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Error over ns per element, both log, a panel per family."""
-    families = list(dict.fromkeys(row["family"] for row in rows))
-    figure, axes = new_figure(len(families))
-    for one, family in zip(axes, families, strict=True):
-        here = [row for row in rows if row["family"] == family]
-        for i, row in enumerate(here):
-            one.scatter(row["ns"], max(row["error"], 1e-9), s=24, color=f"C{i % 10}", label=f"{row['problem']}: {row['method']}")
-        one.set(xscale="log", yscale="log", xlabel="ns per element", ylabel=f"error [{here[0]['unit']}]", title=family)
-        one.legend(frameon=False, fontsize=7)
-    return figure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -31,12 +31,6 @@ def view_ids(text: str | None) -> tuple[int, ...] | None:
     if not re.fullmatch(r"\d+(,\d+)*", text):
         raise InputError(f"--views {text!r}: expected view ids such as 9,19.")
     return tuple(int(v) for v in text.split(","))
-
-
-def poses_file(path: Path, folder: Path) -> Path:
-    """As given, else in the scene's folder."""
-    within = folder / path
-    return within if not path.exists() and within.exists() else path
 
 
 def frame_limits(text: str | None) -> dict[str, int]:
@@ -102,20 +96,3 @@ def scene_path(text: str) -> Path:
 
     path = Path(text)
     return data_folder("example_scene") if text == "example" and not path.exists() else path
-
-
-def load_field(run: Path | None, device: str = "cpu") -> tuple[Path, Any]:
-    """Run folder and its field."""
-    from mmsynth.field.field import Field
-    from mmsynth.fitting.run_folders import chosen_run
-
-    path = chosen_run(run)
-    return path, Field.load(path, device)
-
-
-def load_run(run: Path | None, device: str = "cpu") -> tuple[Path, Any, Any]:
-    """Run folder, field, and the scene it was fitted to."""
-    from mmsynth.scene.load import load_scene
-
-    path, field = load_field(run, device)
-    return path, field, load_scene(Path(field.manifest["scene"]["path"]), list(field.sensors))

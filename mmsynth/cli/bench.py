@@ -19,8 +19,6 @@ from mmsynth.cli.arguments import (
     fit_length,
     frame_limits,
     lengths,
-    load_field,
-    load_run,
     modality_names,
     scene_path,
     seconds_of,
@@ -126,8 +124,9 @@ def bench_twin(
 ) -> None:
     """The sensor's twin: ns per pixel of every effect against its closed form, supersampling, self-calibration, virtual channels."""
     from mmsynth.bench.twin import bench_twin as measure
+    from mmsynth.workflows.runs import open_field
 
-    field = None if run is None else load_field(run)[1]
+    field = None if run is None else open_field(run)[1]
     with progress_bar("bench twin", as_json) as show:
         report = measure(out, field, None if only is None else [name.strip() for name in only.split(",")], progress=show)
     print_report(report, as_json)
@@ -144,10 +143,13 @@ def bench_render(
 ) -> None:
     """Rendering a fitted field: rays/s against error by early termination, sample budget, what is asked for, tiles and threads."""
     from mmsynth.bench.render import bench_render as measure
+    from mmsynth.workflows.runs import open_run
 
-    _, field, scene = load_run(run)
+    opened = open_run(run)
     with progress_bar("bench render", as_json) as show:
-        report = measure(field, scene, out, None if only is None else [name.strip() for name in only.split(",")], threads, repeats, show)
+        report = measure(
+            opened.field, opened.scene, out, None if only is None else [name.strip() for name in only.split(",")], threads, repeats, show
+        )
     print_report(report, as_json)
 
 

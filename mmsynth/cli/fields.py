@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -18,7 +18,6 @@ from mmsynth.cli.arguments import (
     SceneArgument,
     fit_length,
     frame_limits,
-    load_run,
     modality_names,
     modality_pairs,
     scene_path,
@@ -26,14 +25,18 @@ from mmsynth.cli.arguments import (
 from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
 
+if TYPE_CHECKING:
+    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.views.load import Rig
+
 
 @command("info")
 def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
-    from mmsynth.scene.info import describe, render_text
+    from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
 
-    description = describe(load_scene(scene_path(scene)))
+    description = describe_scene(load_scene(scene_path(scene)))
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -52,24 +55,18 @@ def fit(
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
+    from mmsynth.fitting.choices import Choice, choices_of, summary
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.needs import Needs
-    from mmsynth.fitting.run import fit as fit_field
-    from mmsynth.fitting.run_folders import mark_latest, new_run, run_to_resume
     from mmsynth.fitting.trainer import FitProgress
-    from mmsynth.report.report import write_run_report
+    from mmsynth.report.text import fit_text
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
+    from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    loaded = keep_frames(load_scene(scene_path(scene), modality_names(modalities)), frame_limits(frames))
-    name = loaded.root.resolve().name
-    folder = run or (run_to_resume(name) if resume else new_run(name))
-
-    def say(text: str) -> None:
-        if not as_json:
-            print(text)
-
+    loaded = keep_frames(load_scene(scene_path(scene), modalities=modality_names(modalities)), frame_limits(frames))
+    say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")
     with progress_bar("fit", as_json) as show:
@@ -80,38 +77,20 @@ def fit(
 
         told: set[str] = set()
 
-        def explain(evidence: dict[str, str]) -> None:
-            for what, why in evidence.items():
-                if what not in told:
-                    say(f"needs {what}: {why}")
-            told.update(evidence)
+        def explain(choices: dict[str, Choice[Any]]) -> None:
+            for line in summary({name: choice for name, choice in choices.items() if name not in told}, verbose=True):
+                say(f"needs {line}")
+            told.update(choices)
 
         def on_start(needs: Needs) -> None:
-            explain(needs.evidence)
+            explain(needs.choices)
 
-        field = fit_field(
-            loaded,
-            folder,
-            recipe=recipe,
-            steps=steps,
-            budget=seconds,
-            seed=seed,
-            device=pick_device(device),
-            resume=resume,
-            on_start=on_start,
-            on_step=on_step,
-        )
-        explain(field.manifest["needs"]["evidence"])  # with what residuals decided on the way
-    write_run_report(folder, field, scene=loaded)
-    mark_latest(folder)
-    facts = {"run": str(folder), **{k: field.manifest[k] for k in ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")}}
-    if as_json:
-        print(json.dumps(facts))
-        return
-    shown = ", ".join(f"{n} {v:.1f}" for n, v in facts["train_psnr"].items())
-    print(f"{facts['steps']} steps in {facts['seconds']['fit']:.0f} s, {facts['rays_per_s']:,.0f} rays/s")
-    print(f"PSNR on training pixels [dB]: {shown}")
-    print(f"wrote {folder}/ (field.safetensors, manifest.json, preview.png, report.html)")
+        fitted = fit_run(
+            loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
+            on_start=on_start, on_step=on_step,
+        )  # fmt: skip
+        explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
+    print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
 
 
 @command("evaluate")
@@ -123,26 +102,20 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Score the test views."""
-    from mmsynth.operations.evaluation.evaluate import evaluate as score
-    from mmsynth.report.report import write_run_report
+    from mmsynth.operations.evaluation.conversions import evaluate_conversions
     from mmsynth.report.text import conversion_text, score_text
+    from mmsynth.workflows.fit import evaluate_run
+    from mmsynth.workflows.runs import open_run
 
-    folder, field, scene = load_run(run)
-    if convert is not None:
-        from mmsynth.operations.evaluation.conversions import evaluate_conversion
-
-        pairs = modality_pairs(convert, list(field.sensors))
-        found = []
-        with progress_bar("evaluate", as_json) as show:
-            for done, (a, b) in enumerate(pairs):
-                found.append(evaluate_conversion(field, scene, a, b))
-                show(done + 1, len(pairs))
-        print(json.dumps({"conversions": found}) if as_json else conversion_text(found))
-        return
+    opened = open_run(run)
     with progress_bar("evaluate", as_json) as show:
-        scores = score(field, scene, progress=show)
-    write_run_report(folder, field, scores, scene=scene)
-    print(json.dumps(scores) if as_json else score_text(scores))
+        if convert is None:
+            scores = evaluate_run(opened, progress=show)
+            print(json.dumps(scores) if as_json else score_text(scores))
+        else:
+            pairs = modality_pairs(convert, list(opened.field.sensors))
+            conversions = evaluate_conversions(opened.field, opened.scene, pairs, progress=show)
+            print(json.dumps({"conversions": conversions}) if as_json else conversion_text(conversions))
 
 
 @command("batch")
@@ -163,16 +136,18 @@ def batch(
     """Fit many scenes and make a dataset of each; one that fails does not stop the rest. Under torchrun every process takes its share."""
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
-    from mmsynth.operations.output.work_partition import share_of_environment
+    from mmsynth.operations.output.work_partition import partition_of_environment
     from mmsynth.workflows.batch import Job, read_scene_list, run_batch
 
     seconds = fit_length(steps, budget)
-    listed, share = read_scene_list(scenes), share_of_environment()
+    listed, part = read_scene_list(scenes), partition_of_environment()
     names = modality_names(modalities)
     job = Job(
-        load_recipe(recipe), steps, seconds, seed, pick_device(device), None if names is None else tuple(names), poses, rig, file_format
-    )
-    outcomes = run_batch(listed, out, job, share, say=(lambda text: None) if as_json else print)
+        load_recipe(recipe), steps, seconds, seed, pick_device(device),
+        modalities=None if names is None else tuple(names), poses=poses,
+        rig=cast("Rig", rig), file_format=cast("DatasetFormat", file_format),
+    )  # fmt: skip
+    outcomes = run_batch(listed, out, job, part, say=(lambda text: None) if as_json else print)
     if as_json:
         print(json.dumps({"out": str(out), "scenes": outcomes}))
     failed = [name for name, outcome in outcomes.items() if "error" in outcome]

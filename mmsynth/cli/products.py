@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, load_field, load_run, modality_names, poses_file, view_ids
+from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, modality_names, view_ids
 from mmsynth.cli.terminal import command, print_written, progress_bar
 from mmsynth.errors import InputError
+
+if TYPE_CHECKING:
+    from mmsynth.operations.conversion.methods import Method
+    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.output.records import RecordFormat
+    from mmsynth.operations.simulation.simulate import FrameFormat, Split
+    from mmsynth.operations.views.load import Rig
 
 
 @command("convert")
@@ -34,24 +41,20 @@ def convert(
     as_json: JsonOption = False,
 ) -> None:
     """Another modality at the poses of the frames of one, or at any poses."""
-    from mmsynth.operations.conversion.files import convert_at_poses, convert_frames, convert_images
-    from mmsynth.operations.views.trajectories import load_views
+    from mmsynth.operations.conversion.files import convert_files
     from mmsynth.scene.scene import canonical_modality
+    from mmsynth.workflows.runs import open_run
 
-    folder, field, scene = load_run(run)
-    a, b = canonical_modality(source), canonical_modality(target)
+    opened = open_run(run)
+    folder, field, scene = opened.folder, opened.field, opened.scene
     if views is not None and (images or poses):
         raise InputError("--views: frames of the scene are converted with it, expected it without --images and --poses.")
-    chosen = view_ids(views)
-    destination = out or folder / "convert" / f"{a}_to_{b}"
-    with progress_bar(f"{a} to {b}", as_json) as show:
-        if poses is not None:
-            at = load_views(poses_file(poses, scene.root), field, scene, a)
-            written = convert_at_poses(field, scene, a, b, at, destination, images or [], method, as_sensor, file_format, show)
-        elif images:
-            written = convert_images(field, scene, a, b, images, destination, method, as_sensor, file_format, show)
-        else:
-            written = convert_frames(field, scene, a, b, destination, chosen, method, as_sensor, file_format, show)
+    destination = out or folder / "convert" / f"{canonical_modality(source)}_to_{canonical_modality(target)}"
+    with progress_bar(f"{source} to {target}", as_json) as show:
+        written = convert_files(
+            field, scene, destination, source=source, target=target, frames=view_ids(views), views=poses, images=images or (),
+            method=cast("Method", method), as_sensor=as_sensor, file_format=cast("RecordFormat", file_format), progress=show,
+        )  # fmt: skip
     print_written(destination, written, as_json)
 
 
@@ -91,52 +94,42 @@ def generate_dataset(
     process makes its share."""
     from mmsynth.fitting.device import pick_device
     from mmsynth.operations.dataset import generate as dataset
-    from mmsynth.operations.dataset import index as dataset_index
-    from mmsynth.operations.output.work_partition import local_device, share_of_environment
-    from mmsynth.operations.views.coverage import covered_views, training_rays, view_scores
-    from mmsynth.operations.views.trajectories import load_views
+    from mmsynth.operations.dataset.index import verify_dataset
+    from mmsynth.operations.output.work_partition import local_device, partition_of_environment
+    from mmsynth.workflows.runs import latest_run, open_run
 
-    if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
-        raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
-    share = share_of_environment()
-    folder, field, scene = load_run(run, local_device(pick_device(device)))
-    destination = out or folder / "dataset"
     if verify:
-        problems = dataset_index.verify(destination)
+        destination = out or (run or latest_run()) / "dataset"
+        problems = verify_dataset(destination)
         if problems:
             raise InputError(f"{destination}: {len(problems)} problems, first: {problems[0]}")
         print(json.dumps({"out": str(destination), "problems": []}) if as_json else f"{destination}: complete, every checksum matches")
         return
-    views = load_views(poses_file(poses, scene.root), field, scene)
-    names = modality_names(modalities)
-    wanted = None if outputs is None else [] if outputs == "none" else [name.strip() for name in outputs.split(",")]
-    sensors = [*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)]
-    rays = None
-    if min_coverage is not None or wanted is None or "coverage" in wanted:
-        with progress_bar("training rays", as_json) as show:
-            rays = training_rays(field, scene, progress=show)
-    left_out: list[tuple[str, float]] = []
-    if min_coverage is not None:
-        given = len(views)
-        assert rays is not None
-        with progress_bar("coverage", as_json) as show:
-            scores = view_scores(field, rays, views, progress=show)
-        views, left_out = covered_views(views, scores, min_coverage)
-        if left_out and not as_json:
-            named = ", ".join(f"{name} ({score:.2f})" for name, score in left_out)
-            print(f"left out {len(left_out)} of {given} views with a coverage below {min_coverage:g}: {named}")
+    part = partition_of_environment()
+    opened, names = open_run(run, device=local_device(pick_device(device))), modality_names(modalities)
+    folder, field, scene = opened.folder, opened.field, opened.scene
+    destination = out or folder / "dataset"
     with progress_bar("dataset", as_json) as show:
-        written = dataset.generate_dataset(
-            field, views, destination, names, rig, file_format, wanted, rays, sensors, seed, share, progress=show
-        )
-    unseen = [{"name": name, "coverage_score": score} for name, score in left_out]
-    facts = {"dataset": None if written is None else str(written), "views": len(views), "left_out": unseen}
+        made = dataset.generate_dataset(
+            field, poses, destination, scene=scene, modalities=names, rig=cast("Rig", rig),
+            file_format=cast("DatasetFormat", file_format),
+            outputs=None if outputs is None else [] if outputs == "none" else [name.strip() for name in outputs.split(",")],
+            min_coverage=min_coverage,
+            sensors=[*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)], seed=seed,
+            part=part, progress=show,
+        )  # fmt: skip
     if as_json:
-        print(json.dumps(facts))
-    elif written is None:
-        print(f"process {share.number} of {share.processes}: its share of {len(views)} views is in {destination}/, others are at work")
+        unseen = [{"name": name, "coverage_score": score} for name, score in made.left_out]
+        print(json.dumps({"dataset": None if made.path is None else str(made.path), "views": made.views, "left_out": unseen}))
+        return
+    if made.left_out:
+        named = ", ".join(f"{name} ({score:.2f})" for name, score in made.left_out)
+        given = made.views + len(made.left_out)
+        print(f"left out {len(made.left_out)} of {given} views with a coverage below {min_coverage:g}: {named}")
+    if made.path is None:
+        print(f"process {part.number} of {part.processes}: its share of {made.views} views is in {destination}/, others are at work")
     else:
-        print(f"wrote {len(views)} views into {destination}/")
+        print(f"wrote {made.views} views into {destination}/")
 
 
 @command("simulate")
@@ -155,32 +148,27 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """The sensor's digital twin: raw frames as it would have recorded them, a scene that can be fitted again."""
-    from mmsynth.operations.output.work_partition import share_of_environment
+    from mmsynth.operations.output.work_partition import partition_of_environment
     from mmsynth.operations.simulation import simulate as twins
-    from mmsynth.operations.views.trajectories import load_views
+    from mmsynth.workflows.runs import open_run
 
-    if (poses is None) == (views is None):
-        raise InputError("simulate: give one of --poses and --views.")
-    share = share_of_environment()
-    folder, field, scene = load_run(run)
+    part = partition_of_environment()
+    opened = open_run(run)
+    folder, field, scene = opened.folder, opened.field, opened.scene
     destination = out or folder / "simulated"
     with progress_bar("simulate", as_json) as show:
-        if poses is not None:
-            at = load_views(poses_file(poses, scene.root), field, scene)
-            written = twins.simulate(field, sensor, at, destination, seed, file_format, rig, delta, share, show)
-        else:
-            if rig != "native":
-                raise InputError("--rig: frames of the scene have their sensors' own poses, expected it with --poses.")
-            split = {"train": scene.split.train, "test": scene.split.test, "all": None}
-            chosen = split[views] if views in split else view_ids(views)
-            written = twins.simulate_at_frames(field, scene, sensor, destination, chosen, seed, file_format, delta, share, show)
+        written = twins.simulate(
+            field, sensor, destination, views=poses,
+            frames=cast("Split", views) if views in ("train", "test", "all") else view_ids(views), scene=scene, rig=cast("Rig", rig),
+            delta=delta, seed=seed, file_format=cast("FrameFormat", file_format), part=part, progress=show,
+        )  # fmt: skip
     if as_json:
         print(json.dumps({"scene": str(destination)}))
         return
     if written is None:
-        print(f"process {share.number} of {share.processes}: its share of the frames is in {destination}/, others are at work")
+        print(f"process {part.number} of {part.processes}: its share of the frames is in {destination}/, others are at work")
         return
-    for line in twins.foretold(written.parent):
+    for line in twins.expected_errors(written.parent):
         print(line)
     print(f"wrote {written.parent}/ ({written.name}, modalities, sidecars, sensors)")
 
@@ -204,18 +192,22 @@ def calibrate_noise(
     from mmsynth.operations.simulation import calibrate_noise as noise
     from mmsynth.report.text import noise_text
     from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
+    from mmsynth.workflows.runs import open_run
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
-    untold: dict[str, str] = {}
+    failed: dict[str, str] = {}
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
         found, destination = {files[0].name: noise.calibrate_from_frames(files[0], frames)}, out or Path("sensors")
     else:
-        folder, field, scene = load_run(run)
+        opened = open_run(run)
+        folder, field, scene = opened.folder, opened.field, opened.scene
         known = noise.by_modality(files)
         with progress_bar("noise", as_json) as show:
-            found, untold = noise.calibrate_noise(field, scene, modality_names(modalities), known, raw, view_ids(views), progress=show)
+            found, failed = noise.calibrate_noise(
+                field, scene, modalities=modality_names(modalities), known=known, raw=raw, views=view_ids(views), progress=show
+            )
         destination = out or folder / "sensors"
     if found:
         noise.write(found, destination)
@@ -223,8 +215,8 @@ def calibrate_noise(
         print(json.dumps(facts) if as_json else noise_text(found))
         if not as_json:
             print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
-    if untold:
-        raise InputError(" ".join(untold.values()))
+    if failed:
+        raise InputError(" ".join(failed.values()))
 
 
 @command("mesh")
@@ -245,11 +237,13 @@ def mesh(
     """The surface with every modality on it, in the input's frame and unit."""
     from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
     from mmsynth.report.text import mesh_text
+    from mmsynth.workflows.runs import open_field, open_run
 
     if geometry_only and not min_views and against is None:
-        (folder, field), scene = load_field(run), None  # the scene may be elsewhere
+        (folder, field), scene = open_field(run), None  # the scene may be elsewhere
     else:
-        folder, field, scene = load_run(run)
+        opened = open_run(run)
+        folder, field, scene = opened.folder, opened.field, opened.scene
     destination, at = out or folder / "mesh.ply", lengths(distances)
     options = MeshOptions(
         resolution, keep=keep_of(keep), closed=closed, attributes=not geometry_only, min_views=min_views, faces=faces, max_error=max_error

@@ -1,4 +1,4 @@
 """What the scene is: a signed distance field and its radiance.
 
-Start with ``field`` (``Field.render``); ``kernels`` is what it is computed by.
+Start with ``field`` (``Field.render``); ``kernels`` computes it on CPU and GPU.
 """

@@ -1,4 +1,4 @@
-"""Checkpoints: everything a killed fit needs to go on to the same result, in one file, replaced atomically."""
+"""Checkpoints: all that an interrupted fit needs to continue to the same result, in one file, replaced atomically."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
-from mmsynth.field.kernels import Measured
+from mmsynth.field import kernels
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
@@ -48,15 +49,23 @@ class Batch:
     alpha: Tensor
 
     @property
-    def measured(self) -> Measured:
-        """The numbers, as the kernels take them."""
-        return Measured(self.target, self.ray, self.output, self.axes, self.level, self.saturation, self.weight)
+    def measured(self) -> kernels.Measured:
+        """What was measured along the rays, as the kernels take it."""
+        return kernels.Measured(self.target, self.ray, self.output, self.axes, self.level, self.saturation, self.weight)
+
+    def per_ray(self, values: Mapping[str, float]) -> Tensor:
+        """A value for each modality → one for each ray, (R,)."""
+        counts = [rays.stop - rays.start for rays, _ in self.parts.values()]
+        return torch.from_numpy(np.repeat([values[n] for n in self.parts], counts)).to(self.origins.device)
 
 
 class Measurements:
     """All training pixels of one modality.
 
     Integer images stay integers (8 or 16 bit), so a scene takes the memory of its files, decoded, and no more.
+
+    Attributes:
+        radiance_scale: the mean of its values, by which residuals are compared with those of other modalities.
     """
 
     def __init__(self, sensor: Sensor, frames: tuple[Frame, ...], region: Region) -> None:
@@ -76,7 +85,7 @@ class Measurements:
         self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
         poses = np.stack([f.camera_to_world for f in frames])
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
-        self.place(poses)
+        self.set_poses(poses)
         self.directions, self.usable = [], []
         for camera in self.cameras:
             rays, valid = ray_map(camera)
@@ -88,9 +97,9 @@ class Measurements:
         self.ends = np.cumsum(self.counts)
         self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
         drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
-        self.level = float(self.read(drawn, pixel)[0].mean())
+        self.radiance_scale = float(self.read(drawn, pixel)[0].mean())
 
-    def place(self, poses: np.ndarray) -> None:
+    def set_poses(self, poses: np.ndarray) -> None:
         """Let the frames be at (F, 4, 4) camera_to_world, normalised frame."""
         self.rotations = poses[:, :3, :3].astype(np.float32)
         self.origins = poses[:, :3, 3].astype(np.float32)
@@ -189,7 +198,7 @@ def draw(
         parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + count * values)
         r_end += count
         m_end += count * values
-        numbers.append((count * values, m.level, m.sensor.saturation, 1.0 / (len(order) * count * values)))
+        numbers.append((count * values, m.radiance_scale, m.sensor.saturation, 1.0 / (len(order) * count * values)))
     lengths = [n[0] for n in numbers]
     joined = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in lists.items() if v}
     level, saturation, weight = (
@@ -211,7 +220,7 @@ def load_measurements(scene: Scene) -> dict[str, Measurements]:
         if not frames:
             continue
         out[name] = Measurements(sensor, frames, scene.region)
-        if not out[name].level > 0:
+        if not out[name].radiance_scale > 0:
             raise InputError(f"{frames[0].path.parent}: all training frames of {name} are black, expected some light.")
     if not out:
         raise InputError(f"{scene.root}: no modality has a training frame.")

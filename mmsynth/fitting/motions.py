@@ -35,7 +35,7 @@ class Layout:
         poses: (F, 4, 4) camera_to_world. view, sensor: (F,) indices of ``views`` (ids) and ``sensors`` (names).
         anchor: (V,) frame whose axes a view's motion has.
         free: (S,) bool, the sensors whose place on the rig the views tell: the reference and all that share a view with it.
-        carry: (S, 6, 6) a motion of the reference → the same in the axes of the sensor; 0 where a sensor is not free.
+        adjoint: (S, 6, 6) a motion of the reference → the same in the axes of the sensor; 0 where a sensor is not free.
         pixels: (F, 6, 6) of a motion m of a frame, mᵀ pixels m is the mean square displacement of the region in its picture.
     """
 
@@ -46,7 +46,7 @@ class Layout:
     sensors: tuple[str, ...]
     anchor: np.ndarray
     free: np.ndarray
-    carry: np.ndarray
+    adjoint: np.ndarray
     pixels: np.ndarray
 
 
@@ -59,7 +59,7 @@ class Motions:
 
 
 @dataclass(frozen=True)
-class Equations:
+class NormalEquations:
     """What the rays of F frames say: their weighted squared error is error + 2 vector·m + mᵀ matrix m when a frame moves by m.
 
     Attributes:
@@ -71,12 +71,12 @@ class Equations:
     error: np.ndarray
     weight: np.ndarray
 
-    def half(self, index: int) -> Equations:
-        """One of those that ``equations`` keeps apart."""
-        return Equations(self.matrix[index], self.vector[index], self.error[index], self.weight[index])
+    def half(self, index: int) -> NormalEquations:
+        """One of those that ``normal_equations`` keeps apart."""
+        return NormalEquations(self.matrix[index], self.vector[index], self.error[index], self.weight[index])
 
-    def both(self) -> Equations:
-        return Equations(self.matrix.sum(0), self.vector.sum(0), self.error.sum(0), self.weight.sum(0))
+    def both(self) -> NormalEquations:
+        return NormalEquations(self.matrix.sum(0), self.vector.sum(0), self.error.sum(0), self.weight.sum(0))
 
     @property
     def variance(self) -> float:
@@ -85,7 +85,7 @@ class Equations:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RayJacobian:
     """R rays, in float64: their frame (R,) int64, residual (R,), its derivatives to origins and directions (R, 3), directions (R, 3)."""
 
     frame: Tensor
@@ -106,15 +106,15 @@ def layout_of(frames: list[Frame], sensors: tuple[str, ...], region: Region) -> 
     views = tuple(sorted({f.view for f in frames}))
     view, sensor = np.array([views.index(f.view) for f in frames]), np.array([sensors.index(f.sensor) for f in frames])
     anchor = np.array([min(np.flatnonzero(view == v), key=lambda f: sensor[f]) for v in range(len(views))])
-    carry = np.zeros((len(sensors), 6, 6))
+    adjoint = np.zeros((len(sensors), 6, 6))
     for f in reversed(range(len(frames))):
         if sensor[anchor[view[f]]] == 0:
-            carry[sensor[f]] = _carried(poses[f], poses[anchor[view[f]]])
+            adjoint[sensor[f]] = _adjoint(poses[f], poses[anchor[view[f]]])
     focal = np.array([0.5 * (f.camera.fx + f.camera.fy) for f in frames])
-    return Layout(poses, view, sensor, views, sensors, anchor, np.any(carry != 0, axis=(1, 2)), carry, _pixels(poses, focal))
+    return Layout(poses, view, sensor, views, sensors, anchor, np.any(adjoint != 0, axis=(1, 2)), adjoint, _pixels(poses, focal))
 
 
-def rigid(motion: np.ndarray) -> np.ndarray:
+def motion_to_matrix(motion: np.ndarray) -> np.ndarray:
     """(N, 6) → (N, 4, 4): rotation by the exponential map, translation as it is."""
     out = np.tile(np.eye(4), (len(motion), 1, 1))
     out[:, :3, :3] = Rotation.from_rotvec(motion[:, :3]).as_matrix()
@@ -122,23 +122,23 @@ def rigid(motion: np.ndarray) -> np.ndarray:
     return out
 
 
-def motion_of(matrix: np.ndarray) -> np.ndarray:
-    """The inverse of ``rigid``: (N, 4, 4) → (N, 6)."""
+def matrix_to_motion(matrix: np.ndarray) -> np.ndarray:
+    """The inverse of ``motion_to_matrix``: (N, 4, 4) → (N, 6)."""
     return np.concatenate([Rotation.from_matrix(matrix[:, :3, :3]).as_rotvec(), matrix[:, :3, 3]], 1)
 
 
 def in_world(layout: Layout, motions: Motions) -> np.ndarray:
     """(V, 4, 4) motions of the views, in the normalised frame and no longer in the axes of their anchors."""
     anchors = layout.poses[layout.anchor]
-    return anchors @ rigid(motions.views) @ np.linalg.inv(anchors)
+    return anchors @ motion_to_matrix(motions.views) @ np.linalg.inv(anchors)
 
 
 def moved(layout: Layout, motions: Motions) -> np.ndarray:
     """(F, 4, 4) camera_to_world of all frames after the motions of their views and sensors."""
-    return in_world(layout, motions)[layout.view] @ layout.poses @ rigid(motions.sensors)[layout.sensor]
+    return in_world(layout, motions)[layout.view] @ layout.poses @ motion_to_matrix(motions.sensors)[layout.sensor]
 
 
-def derivative(rows: Rows, rotations: Tensor) -> Tensor:
+def derivative(rows: RayJacobian, rotations: Tensor) -> Tensor:
     """Of the residuals to the motions of their frames: (R, 6); rotations: (R, 3, 3) camera to world.
 
     A small rotation ω of a frame R moves a direction d by R ω × d, and gᵀ (R ω × d) = ωᵀ Rᵀ (d × g).
@@ -147,7 +147,7 @@ def derivative(rows: Rows, rotations: Tensor) -> Tensor:
     return torch.cat([torch.einsum("nij,ni->nj", rotations, g) for g in (turned, rows.by_origin)], 1)
 
 
-def equations(parts: Iterable[Rows], poses: np.ndarray) -> Equations:
+def normal_equations(parts: Iterable[RayJacobian], poses: np.ndarray) -> NormalEquations:
     """Sums over rays, in two halves (2, F, ...); poses: (F, 4, 4) as they are now."""
     frames = len(poses)
     rotations = torch.from_numpy(poses[:, :3, :3])
@@ -160,34 +160,34 @@ def equations(parts: Iterable[Rows], poses: np.ndarray) -> Equations:
         half = torch.arange(len(r)) % 2
         sums.index_add_(0, rows.frame + frames * half, weight[:, None] * torch.cat(products, 1))
     matrix, vector, error, weight = sums.reshape(2, frames, -1).split([36, 6, 1, 1], -1)
-    return Equations(matrix.reshape(2, frames, 6, 6).numpy(), vector.numpy(), error[..., 0].numpy(), weight[..., 0].numpy())
+    return NormalEquations(matrix.reshape(2, frames, 6, 6).numpy(), vector.numpy(), error[..., 0].numpy(), weight[..., 0].numpy())
 
 
-def solve(said: Equations, layout: Layout, motions: Motions, views: bool, rig: bool, prior: float) -> Motions:
-    """The Gauss-Newton step of the motions of views, of all free sensors, or both: the reference moves, too (see ``on_the_rig``).
+def solve(equations: NormalEquations, layout: Layout, motions: Motions, views: bool, rig: bool, prior: float) -> Motions:
+    """The Gauss-Newton step of the motions of views, of all free sensors, or both: the reference moves, too (see ``fix_reference``).
 
     Args:
-        said: (F, ...). motions: as they are. prior: standard deviation of each of the six numbers; what no ray tells stays 0.
+        equations: (F, ...). motions: as they are. prior: standard deviation of each of the six numbers; what no ray tells stays 0.
     """
     now = moved(layout, motions)
-    here = _carried(now, now[layout.anchor][layout.view])
+    here = _adjoint(now, now[layout.anchor][layout.view])
     back = np.swapaxes(here, 1, 2)
-    precision = said.variance / prior**2
+    precision = equations.variance / prior**2
     own = precision * np.eye(6)
     to_view, to_sensor = np.zeros_like(motions.views), np.zeros_like(motions.sensors)
     free = np.flatnonzero(layout.free)
     # of the views: block diagonal; of the sensors, after the views are eliminated: small and dense
-    matrix_v = _grouped(back @ said.matrix @ here, layout.view, len(layout.views)) + own
-    vector_v = _grouped(_times(back, said.vector), layout.view, len(layout.views)) + precision * motions.views
-    matrix_s = _grouped(said.matrix, layout.sensor, len(layout.sensors)) + own
-    vector_s = _grouped(said.vector, layout.sensor, len(layout.sensors)) + precision * motions.sensors
+    matrix_v = _grouped(back @ equations.matrix @ here, layout.view, len(layout.views)) + own
+    vector_v = _grouped(_times(back, equations.vector), layout.view, len(layout.views)) + precision * motions.views
+    matrix_s = _grouped(equations.matrix, layout.sensor, len(layout.sensors)) + own
+    vector_s = _grouped(equations.vector, layout.sensor, len(layout.sensors)) + precision * motions.sensors
     if not rig:
         return Motions(-_solved(matrix_v, vector_v), to_sensor)
     if not views:
         to_sensor[free] = -_solved(matrix_s[free], vector_s[free])
         return Motions(to_view, to_sensor)
     pairs = np.zeros((len(layout.views), len(layout.sensors), 6, 6))
-    np.add.at(pairs, (layout.view, layout.sensor), back @ said.matrix)
+    np.add.at(pairs, (layout.view, layout.sensor), back @ equations.matrix)
     cross = pairs[:, free].swapaxes(1, 2).reshape(len(layout.views), 6, 6 * len(free))
     blocks = np.zeros((len(free), 6, len(free), 6))
     blocks[range(len(free)), :, range(len(free))] = matrix_s[free]
@@ -198,35 +198,37 @@ def solve(said: Equations, layout: Layout, motions: Motions, views: bool, rig: b
     return Motions(-_solved(matrix_v, vector_v + cross @ of_sensors), to_sensor)
 
 
-def confirmed(said: Equations, layout: Layout, motions: Motions, views: bool, rig: bool, prior: float) -> tuple[Motions, float]:
+def cross_validated_step(
+    equations: NormalEquations, layout: Layout, motions: Motions, views: bool, rig: bool, prior: float
+) -> tuple[Motions, float]:
     """The step of ``solve``, as long as rays that it was not learned from confirm, and the share of their error that it saves.
 
     Each half of the rays (2, F, ...) is solved for alone. The factors of the motions of views and of sensors at which the error of
     the other half is least are signal / (signal + noise); all rays together have half the noise. Noise alone has a factor of 0.
     """
     now = moved(layout, motions)
-    here = _carried(now, now[layout.anchor][layout.view])
+    here = _adjoint(now, now[layout.anchor][layout.view])
     quadratic, linear = np.zeros((2, 2)), np.zeros(2)
     for learned, other in ((0, 1), (1, 0)):
-        step = solve(said.half(learned), layout, motions, views, rig, prior)
+        step = solve(equations.half(learned), layout, motions, views, rig, prior)
         of_frames = np.stack([_times(here, step.views[layout.view]), step.sensors[layout.sensor]])
-        judge = said.half(other)
+        judge = equations.half(other)
         quadratic += np.einsum("kfi,fij,lfj->kl", of_frames, judge.matrix, of_frames)
         linear += np.einsum("kfi,fi->k", of_frames, judge.vector)
     factor = np.clip(-np.linalg.lstsq(quadratic, linear, rcond=1e-9)[0], 0.0, 1.0)
-    saved = -(2.0 * factor @ linear + factor @ quadratic @ factor) / float(said.error.sum())
+    saved = -(2.0 * factor @ linear + factor @ quadratic @ factor) / float(equations.error.sum())
     factor = 2.0 * factor / (1.0 + factor)
-    step = solve(said.both(), layout, motions, views, rig, prior)
+    step = solve(equations.both(), layout, motions, views, rig, prior)
     return Motions(factor[0] * step.views, factor[1] * step.sensors), float(saved)
 
 
-def on_the_rig(layout: Layout, step: Motions, views: bool) -> Motions:
+def fix_reference(layout: Layout, step: Motions, views: bool) -> Motions:
     """The same step for the sensors relative to each other, with the reference at rest; its part goes to the views, if they move.
 
     The reference is solved for like every sensor and taken out after: what all of them want in common is that the surface that
     was learned so far lies elsewhere, which is no matter of the rig.
     """
-    shared = layout.carry @ step.sensors[0]
+    shared = layout.adjoint @ step.sensors[0]
     sensors = step.sensors - shared
     sensors[0] = 0.0  # not only up to rounding
     return Motions(step.views + shared[layout.sensor[layout.anchor]] * views, sensors)
@@ -239,7 +241,7 @@ def advance(layout: Layout, motions: Motions, step: Motions) -> Motions:
     have the one with the least displacement in the pictures (least squares over the region), so that the scene stays in the
     frame of the input, where views are that are not learned from. A view that never moved stays.
     """
-    views = motion_of(rigid(motions.views) @ rigid(step.views))
+    views = matrix_to_motion(motion_to_matrix(motions.views) @ motion_to_matrix(step.views))
     some = np.flatnonzero(np.any(views != 0, axis=1))
     if len(some):
         anchors = layout.poses[layout.anchor[some]]
@@ -252,7 +254,7 @@ def advance(layout: Layout, motions: Motions, step: Motions) -> Motions:
         normal = np.einsum("vai,vab,vbj->ij", similarity, metric, similarity)
         right = np.einsum("vai,vab,vb->i", similarity, metric, views[some])
         views[some] -= similarity @ np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    return Motions(views, motion_of(rigid(motions.sensors) @ rigid(step.sensors)))
+    return Motions(views, matrix_to_motion(motion_to_matrix(motions.sensors) @ motion_to_matrix(step.sensors)))
 
 
 def _pixels(poses: np.ndarray, focal: np.ndarray) -> np.ndarray:
@@ -265,7 +267,7 @@ def _pixels(poses: np.ndarray, focal: np.ndarray) -> np.ndarray:
     return focal[:, None, None] ** 2 * np.einsum("fqai,fqaj->fij", shift, shift) / len(_POINTS)
 
 
-def _carried(to: np.ndarray, of: np.ndarray) -> np.ndarray:
+def _adjoint(to: np.ndarray, of: np.ndarray) -> np.ndarray:
     """(..., 6, 6) a small motion of the camera ``of`` → the same of a camera ``to`` that it carries along: poses (..., 4, 4)."""
     back, turn = np.swapaxes(to[..., :3, :3], -1, -2), of[..., :3, :3]
     out = np.zeros((*to.shape[:-2], 6, 6))

@@ -1,4 +1,4 @@
-"""What this scene needs: sizes and parts decided from the cameras and pixels, with the evidence kept.
+"""What this scene needs: sizes and parts decided from the cameras and pixels, one function for each question, each with its reason.
 
 Model only what a scene needs: no background where nothing but black lies behind the region of interest, no tensor head
 without a polarization sensor (heads follow the sensors), no grid level finer than a pixel.
@@ -7,140 +7,246 @@ without a polarization sensor (heads follow the sensors), no grid level finer th
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from mmsynth.field.field import Design
+from mmsynth.fitting.choices import Choice, summary, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
 from mmsynth.scene.scene import Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
-_HORIZON = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
+_OUTERMOST = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
 _COARSE = 128  # cells across the grid that a surface may have however few the measurements: small pictures show large things
+_PAST = 0.005  # share of the pixels that see past the region, below which nothing is there
+_RAYS_PER_SECOND = 70_000  # of a fit, about: a constant, so that the design does not depend on the clock
+_SAMPLES_PER_RAY = 10  # of a fit, about
+_BY_RECIPE = "asked for by the recipe"
 
 
 @dataclass(frozen=True)
 class Needs:
-    """The choice and why.
+    """What was chosen and why.
 
     Attributes:
-        footprint: the finest detail to expect at the region's centre, in radii.
-        scarce: modalities with so few pixels that they would spoil what others know better: they learn their colours from the
+        footprint: the finest detail to expect at the region's centre, in radii. sharpness_end: of the surface [1/region radius].
+        black_background: whether black pixels say that nothing is there.
+        sparse: modalities with so few pixels that they would spoil what others know better: they learn their colours from the
             geometry and appearance of the others. share: of the rays that each modality gets, relative to a plentiful one.
-        evidence: one line per choice.
+        choices: by name, those made so far.
     """
 
     design: Design
     footprint: float
     sharpness_end: float
     black_background: bool
-    scarce: tuple[str, ...]
+    sparse: tuple[str, ...]
     share: dict[str, float]
-    evidence: dict[str, str]
+    choices: dict[str, Choice[Any]]
+
+    def with_choices(self, more: Mapping[str, Choice[Any]]) -> Needs:
+        """With what was decided since."""
+        return replace(self, choices={**self.choices, **more})
+
+    def summary(self, verbose: bool = False) -> list[str]:
+        """One line for each choice that changed something; ``verbose``: for all of them."""
+        return summary(self.choices, verbose)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Finest cells across the region of the two grids, and the share of a pixel's sharpness that the surface can have."""
+
+    surface: int
+    radiance: int
+    sharpness: float
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What the questions are answered from: of ``sampled`` pixels the share whose ray misses the region (``outside``), of these the share
+    that is bright and the mean light, relative to bright pixels; lengths in radii."""
+
+    scene: Scene
+    measurements: dict[str, Measurements]
+    recipe: Recipe
+    rays_to_come: float
+    pixels: int
+    footprint: float
+    outside: float
+    bright: float
+    light: float
+    sampled: int
+
+    @property
+    def coarser(self) -> float:
+        """When fewer rays come than there are pixels, what can be learned is coarser than a pixel, by the root of the ratio."""
+        return max(1.0, math.sqrt(self.pixels / self.rays_to_come))
+
+    @property
+    def transparent(self) -> bool:
+        return self.scene.black_background or any(m.has_alpha for m in self.measurements.values())
+
+
+def expected_rays(recipe: Recipe, steps: int | None, budget: float | None) -> float:
+    """Rays that a fit of so many steps or seconds will see, about."""
+    return steps * recipe.sampling.samples_per_step / _SAMPLES_PER_RAY if steps is not None else (budget or 0.0) * _RAYS_PER_SECOND
 
 
 def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, seed: int, rays_to_come: float) -> Needs:
     """Look at the cameras and at 4096 random pixels per modality.
 
     Args:
-        rays_to_come: about how many rays the fit will see. When that is fewer than there are pixels, what it can learn is
-            coarser than a pixel, by the square root of the ratio.
+        rays_to_come: about how many rays the fit will see (``expected_rays``).
     """
     pixels = sum(int(m.ends[-1]) for m in measurements.values())
-    coarser = max(1.0, math.sqrt(pixels / rays_to_come))
-    footprint = _footprint(measurements) * coarser
-    outside, bright, light, rays = _look_outside(measurements, np.random.default_rng((seed, 7)))
-    evidence = {}
-    if recipe.background != "auto":
-        background = recipe.background == "on"
-        evidence["background"] = f"{recipe.background}: asked for by the recipe"
-    elif scene.black_background or any(m.has_alpha for m in measurements.values()):
-        background = False
-        evidence["background"] = "off: the input says that it is black or transparent"
-    elif outside < 0.005:
-        background = False
-        evidence["background"] = f"off: {outside:.1%} of {rays} sampled pixels see past the region of interest"
-    else:
-        background = bright > 0.05
-        verdict = "on" if background else "off"
-        past = f"{outside:.1%} of {rays} sampled pixels see past the region of interest"
-        cost = "; costs a grid twice as wide, and rays that go on to the end" if background else ""
-        evidence["background"] = f"{verdict}: {past}, {bright:.1%} of these are not black{cost}"
-    dim = "nothing is seen past the region of interest" if outside < 0.005 else f"what is past it has {light:.1%} of the brightest light"
+    seen = _look_outside(measurements, np.random.default_rng((seed, 7)))
+    facts = _Facts(scene, measurements, recipe, rays_to_come, pixels, _footprint(measurements), *seen)
+    background = _background(facts)
+    far_light = _far_light(facts, background.value)
+    resolution = _resolution(facts, background.value)
+    spheres = _initial_spheres(facts, background.value)
+    share = _ray_shares(facts)
+    rows = _table_rows(facts)
+    choices: dict[str, Choice[Any]] = {
+        "background": background,
+        "far_light": far_light,
+        "resolution": resolution,
+        "initial_sphere": spheres,
+        "sparse": share,
+        "tensor_head": _tensor_head(facts),
+    }
+    if recipe.schedule.tables_at == 0:
+        choices["tables"] = rows  # else the last word on them is said when the cells at the surface are counted
+    design = Design(
+        surface_levels=recipe.surface.levels,
+        surface_rows_log2=rows.value[0],
+        surface_finest=resolution.value.surface,
+        radiance_levels=recipe.radiance.levels,
+        radiance_rows_log2=rows.value[1],
+        radiance_finest=resolution.value.radiance,
+        background=background.value,
+        far_light=far_light.value,
+        outer_radius=spheres.value[1],
+        surface_hidden=recipe.surface.hidden_width,
+        radiance_hidden=recipe.radiance.hidden_width,
+        occupancy=recipe.sampling.occupancy_resolution,
+        initial_radius=spheres.value[0],
+    )
+    footprint = facts.footprint * facts.coarser
+    sharpness = recipe.schedule.sharpness_per_footprint * resolution.value.sharpness / footprint
+    return Needs(
+        design=design,
+        footprint=footprint,
+        sharpness_end=max(sharpness, 2 * recipe.schedule.sharpness_start),
+        black_background=not background.value and facts.outside >= _PAST,
+        sparse=tuple(n for n, s in share.value.items() if s < 1.0),
+        share=share.value,
+        choices=choices,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- the questions, in their order
+
+
+def _background(f: _Facts) -> Choice[bool]:
+    """Is what lies outside the region modelled?"""
+    asked = f.recipe.surface.background
+    if asked != "auto":
+        return switch(asked == "on", _BY_RECIPE)
+    if f.transparent:
+        return switch(False, "the input says that it is black or transparent")
+    past = f"{f.outside:.1%} of {f.sampled} sampled pixels see past the region of interest"
+    if f.outside < _PAST:
+        return switch(False, past)
+    needed = f.bright > 0.05
+    cost = "; costs a grid twice as wide, and rays that go on to the end" if needed else ""
+    return switch(needed, f"{past}, {f.bright:.1%} of these are not black{cost}")
+
+
+def _far_light(f: _Facts, background: bool) -> Choice[bool]:
+    """Where the background is not modelled: has what passes the region a colour per direction?"""
+    asked = f.recipe.radiance.far_light
     if background:
-        beyond, evidence["beyond"] = False, "off: the background is modelled"
-    elif recipe.decide_at >= 1.0:
-        beyond, evidence["beyond"] = False, "off: it is learned once residuals have decided, which the recipe leaves out (decide_at = 1)"
-    elif recipe.beyond != "auto":
-        beyond, evidence["beyond"] = recipe.beyond == "on", f"{recipe.beyond}: asked for by the recipe"
-    elif scene.black_background or any(m.has_alpha for m in measurements.values()):
-        beyond, evidence["beyond"] = False, "off: the input says that it is black or transparent"
-    else:
-        beyond = outside >= 0.005 and light > 0.01
-        evidence["beyond"] = f"{'on' if beyond else 'off'}: {dim}"
+        return switch(False, "the background is modelled")
+    if f.recipe.schedule.decide_at >= 1.0:
+        return switch(False, "it is learned once residuals have decided, which the recipe leaves out (decide_at = 1)")
+    if asked != "auto":
+        return switch(asked == "on", _BY_RECIPE)
+    if f.transparent:
+        return switch(False, "the input says that it is black or transparent")
+    if f.outside < _PAST:
+        return switch(False, "nothing is seen past the region of interest")
+    return switch(f.light > 0.01, f"what is past it has {f.light:.1%} of the brightest light")
+
+
+def _resolution(f: _Facts, background: bool) -> Choice[Resolution]:
+    """How fine are the grids?"""
+    surface, coarser = f.recipe.surface, f.coarser
+    footprint = f.footprint * coarser
     # a cell of half a pixel is the finest that any pixel can tell; hashed levels beyond 2048 only collide
     extent = 2 if background else 1  # contracted space is twice as wide
-    finest = extent * recipe.surface_cells / footprint
+    finest = 2 * extent * surface.cells_per_pixel / footprint
     # geometry that few measurements see bends to each of them; appearance may, it is only looked at from where they were taken
-    seen_enough = max(_COARSE, math.sqrt(min(pixels, rays_to_come) / (_FACES * recipe.measurements_per_cell)))
-    surface_finest = int(np.clip(min(finest, seen_enough), 32, 1024))
-    radiance_finest = int(np.clip(extent * recipe.radiance_cells / footprint, 64, 2048))
-    cells = f"finest cells {2 / surface_finest:.2g} (surface), {2 / radiance_finest:.2g} (radiance)"
-    seen = f", {coarser:.1f} pixels apart for {rays_to_come:.1e} rays on {pixels:.1e} pixels" if coarser > 1 else ""
-    few = f", the surface's for {recipe.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
-    evidence["resolution"] = f"a pixel is {footprint / coarser:.2g} radii at the centre{seen}: {cells}{few}"
-    radius = recipe.initial_radius or (0.4 if background else 0.5)
-    farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in measurements.values())
+    seen_enough = max(_COARSE, math.sqrt(min(f.pixels, f.rays_to_come) / (_FACES * surface.measurements_per_cell)))
+    across = int(np.clip(min(finest, seen_enough), 32, 1024))
+    radiance = int(np.clip(2 * extent * f.recipe.radiance.cells_per_pixel / footprint, 64, 2048))
+    cells = f"finest cells {2 / across:.2g} (surface), {2 / radiance:.2g} (radiance)"
+    seen = f", {coarser:.1f} pixels apart for {f.rays_to_come:.1e} rays on {f.pixels:.1e} pixels" if coarser > 1 else ""
+    few = f", the surface's for {surface.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
+    why = f"a pixel is {f.footprint:.2g} radii at the centre{seen}: {cells}{few}"
+    return Choice(Resolution(across, radiance, min(1.0, seen_enough / finest)), why, bool(seen or few))
+
+
+def _initial_spheres(f: _Facts, background: bool) -> Choice[tuple[float, float]]:
+    """Radii of the sphere that a fit starts from, and of the one around everything, in contracted space."""
+    asked = f.recipe.surface
+    radius = asked.initial_radius or (0.4 if background else 0.5)
+    farthest = max(float(np.linalg.norm(m.origins, axis=1).max()) for m in f.measurements.values())
     # measured: what starts far behind the scene reaches it late, and in streaks
-    horizon = recipe.horizon or 2.0 - 1.0 / (_HORIZON * max(farthest, 1.0))
-    around = f", one around everything at {1 / (2 - horizon):.2g} radii" if background else ""
-    why = "asked for by the recipe" if recipe.initial_radius else f"background {'on' if background else 'off'}"
-    evidence["initial_sphere"] = f"radius {radius:g}: {why}{around}"
-    share = _shares(measurements, recipe.scarce_below)
-    scarce = tuple(n for n, s in share.items() if s < 1.0)
-    frames = ", ".join(f"{n} {len(measurements[n].origins)} frames" for n in scarce)
-    evidence["scarce"] = f"on: {frames}: learned from the geometry of the others" if scarce else "off: all modalities have enough pixels"
-    pol = [n for n, m in measurements.items() if m.sensor.is_polarization]
-    evidence["tensor_head"] = f"on: {', '.join(pol)}; costs six outputs each" if pol else "off: no polarization sensor"
-    surface_rows, radiance_rows = recipe.surface_rows_log2, recipe.radiance_rows_log2
-    if recipe.tables_at == 0:
-        evidence["tables"] = f"2^{surface_rows} and 2^{radiance_rows} rows a level: asked for by the recipe"
-    else:
-        # a row that few rays meet is noise, and costs as much as any other
-        surface_rows = rows_log2(rays_to_come / (2.0 * recipe.rays_per_row), surface_rows)
-        radiance_rows = rows_log2(rays_to_come / recipe.rays_per_row, radiance_rows)
-    design = Design(
-        surface_levels=recipe.surface_levels,
-        surface_rows_log2=surface_rows,
-        surface_finest=surface_finest,
-        radiance_levels=recipe.radiance_levels,
-        radiance_rows_log2=radiance_rows,
-        radiance_finest=radiance_finest,
-        background=background,
-        far_light=beyond,
-        outer_radius=horizon,
-        surface_hidden=recipe.surface_hidden,
-        radiance_hidden=recipe.radiance_hidden,
-        occupancy=recipe.occupancy_resolution,
-        initial_radius=radius,
-    )
-    black = not background and outside >= 0.005
-    sharpness = recipe.sharpness_end * min(1.0, seen_enough / finest) / footprint
-    return Needs(design, footprint, max(sharpness, 2 * recipe.sharpness_start), black, scarce, share, evidence)
+    outer = asked.outer_radius or 2.0 - 1.0 / (_OUTERMOST * max(farthest, 1.0))
+    around = f", one around everything at {1 / (2 - outer):.2g} radii" if background else ""
+    why = _BY_RECIPE if asked.initial_radius else f"background {'on' if background else 'off'}"
+    by_recipe = asked.initial_radius is not None or asked.outer_radius is not None
+    return Choice((radius, outer), f"radius {radius:g}: {why}{around}", by_recipe)
 
 
-def _shares(measurements: dict[str, Measurements], below: float) -> dict[str, float]:
-    """1 for a modality with at least ``below`` of the pixels of the one that has most, else in proportion to its pixels."""
-    pixels = {n: int(m.ends[-1]) for n, m in measurements.items()}
-    enough = below * max(pixels.values())
-    return {n: min(1.0, count / enough) if enough else 1.0 for n, count in pixels.items()}
+def _ray_shares(f: _Facts) -> Choice[dict[str, float]]:
+    """Of the rays that each modality gets: 1 where it has enough of the most plentiful one's pixels, else in proportion to its own."""
+    pixels = {n: int(m.ends[-1]) for n, m in f.measurements.items()}
+    enough = f.recipe.sampling.sparse_below * max(pixels.values())
+    share = {n: min(1.0, count / enough) if enough else 1.0 for n, count in pixels.items()}
+    sparse = ", ".join(f"{n} {len(f.measurements[n].origins)} frames" for n, s in share.items() if s < 1.0)
+    why = f"on: {sparse}: learned from the geometry of the others" if sparse else "off: all modalities have enough pixels"
+    return Choice(share, why, bool(sparse))
+
+
+def _tensor_head(f: _Facts) -> Choice[bool]:
+    """Is light a coherency tensor for some sensors?"""
+    names = [n for n, m in f.measurements.items() if m.sensor.is_polarization]
+    return switch(bool(names), f"{', '.join(names)}; costs six outputs each" if names else "no polarization sensor")
+
+
+def _table_rows(f: _Facts) -> Choice[tuple[int, int]]:
+    """log2 of the most rows of a level's table, of the surface and of the radiance."""
+    surface, radiance = f.recipe.surface, f.recipe.radiance
+    most = surface.max_rows_log2, radiance.max_rows_log2
+    if f.recipe.schedule.tables_at == 0:
+        return Choice(most, f"2^{most[0]} and 2^{most[1]} rows a level: {_BY_RECIPE}", True)
+    # a row that few rays meet is noise, and costs as much as any other
+    rows = rows_log2(f.rays_to_come / surface.rays_per_row, most[0]), rows_log2(f.rays_to_come / radiance.rays_per_row, most[1])
+    return Choice(rows, f"at most 2^{rows[0]} and 2^{rows[1]} rows a level for {f.rays_to_come:.1e} rays", rows != most)
+
+
+# --------------------------------------------------------------------------------------------------------------------- the facts
 
 
 def _footprint(measurements: dict[str, Measurements]) -> float:
@@ -153,7 +259,7 @@ def _footprint(measurements: dict[str, Measurements]) -> float:
 
 
 def _look_outside(measurements: dict[str, Measurements], random: np.random.Generator) -> tuple[float, float, float, int]:
-    """Share of pixels whose ray misses the region; of these the share that is bright and the mean, relative to bright pixels; how many."""
+    """``outside, bright, light, sampled`` of ``_Facts``."""
     misses = bright = rays = 0
     light = 0.0
     for m in measurements.values():

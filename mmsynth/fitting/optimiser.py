@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) of a field's parameters, and their mean over the last steps."""
+"""Adam (Kingma and Ba 2015) for a field's parameters, and an exponential mean of them over the last steps."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Adam:
 
 
 class Average:
-    """Exponential mean of named parameters (Polyak and Juditsky 1992): what batches shake in each is not in the mean."""
+    """Exponential mean of named parameters (Polyak and Juditsky 1992): the noise of single batches averages out."""
 
     def __init__(self, parameters: dict[str, nn.Parameter]) -> None:
         self.parameters = parameters

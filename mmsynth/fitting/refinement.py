@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor
 
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Corrections, Field
 from mmsynth.fitting import motions as poses
+from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements, in_order
-from mmsynth.fitting.motions import Equations, Motions, Rows
-from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian
+from mmsynth.fitting.recipe import PosesRecipe
 from mmsynth.scene.scene import Scene
 
 _AT_ONCE = 4096  # rays of a batch
@@ -23,29 +26,45 @@ _PER_VIEW = 64  # rays of a step at least
 _PER_FIT = 400_000  # rays from the beginning to the end of a fit
 _PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
 
-See = Callable[[dict[str, int], np.random.Generator], Rows]
+Look = Callable[[dict[str, int], np.random.Generator], RayJacobian]
 
 
-def see(field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, beyond: bool, sampling: kernels.Sampling) -> Rows:
-    """Residuals of rays, the mean over the numbers measured along each, in units of the modality's level, and their derivatives.
+@dataclass(frozen=True)
+class MotionDecisions:
+    """Whether views move, and sensors on the rig."""
+
+    views: Choice[bool]
+    rig: Choice[bool]
+
+    @property
+    def any(self) -> bool:
+        return self.views.value or self.rig.value
+
+
+def ray_residuals(
+    field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, far_light: bool, sampling: kernels.Sampling
+) -> RayJacobian:
+    """Residuals of rays, the mean over what was measured along each, in units of the modality's level, and their derivatives.
 
     Args:
-        degrees: (R,) of the harmonics of direction. gain: (M,) factors of the predicted numbers, None: 1.
-        beyond: whether light from beyond the region is seen.
+        degrees: (R,) of the harmonics of direction. gain: (M,) factors of what is predicted, None: 1.
+        far_light: whether light from beyond the region is seen.
     """
     origins, directions = (x.detach().requires_grad_() for x in (batch.origins, batch.directions))
     middle = torch.full((len(origins),), 0.5, device=origins.device)
     field.requires_grad_(False)  # rays alone: tables would gather gradients that the next step of the fit takes for its own
-    with torch.enable_grad():
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
-        features, opacity = field.with_far_light(hits) if beyond else (hits.features, hits.opacity)
-        predicted = kernels.predict(field.shader(features, directions, degrees), opacity, batch.measured)
-        relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.level
-        mean = torch.zeros_like(middle).index_add(0, batch.ray, relative) / torch.bincount(batch.ray, minlength=len(origins))
-        gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
-    field.requires_grad_(True)
+    try:
+        with torch.enable_grad():
+            hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
+            features, opacity = field.with_far_light(hits) if far_light else (hits.features, hits.opacity)
+            predicted = kernels.predict(field.shader(features, directions, degrees), opacity, batch.measured)
+            relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.level
+            mean = torch.zeros_like(middle).index_add(0, batch.ray, relative) / torch.bincount(batch.ray, minlength=len(origins))
+            gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
+    finally:
+        field.requires_grad_(True)
     frame = batch.ray.new_zeros(len(origins)).scatter(0, batch.ray, batch.frame)
-    return Rows(frame.cpu(), *(x.detach().cpu().double() for x in (mean, *gradients, batch.directions)))
+    return RayJacobian(frame.cpu(), *(x.detach().cpu().double() for x in (mean, *gradients, batch.directions)))
 
 
 class Refinement:
@@ -55,80 +74,89 @@ class Refinement:
     from where they are then.
     """
 
-    def __init__(self, scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, footprint: float, seed: int) -> None:
+    def __init__(self, scene: Scene, measurements: dict[str, Measurements], recipe: PosesRecipe, footprint: float, seed: int) -> None:
         self.measurements, self.recipe, self.prior, self.seed = measurements, recipe, _PRIOR * footprint, seed
         frames = [f for n in in_order(measurements) for f in scene.frames_of(n, scene.split.train)]
         self.region = scene.region
         self.layout = poses.layout_of(frames, tuple(measurements), scene.region)
         self.motions = Motions(np.zeros((len(self.layout.views), 6)), np.zeros((len(self.layout.sensors), 6)))
-        self.decided: dict[str, bool] | None = None
-        self.evidence: dict[str, str] = {}
-        self.steps, self.next = 0, recipe.poses_at
-        self.possible = {
-            "poses": recipe.poses != "off" and len(self.layout.views) > 1,
-            "rig": recipe.rig != "off" and int(self.layout.free.sum()) > 1,
-        }
-        if not any(self.possible.values()):
-            self._settle({}, {})
+        self.decided: MotionDecisions | None = None
+        self.steps, self.next = 0, recipe.start_at
+        self.views_can = recipe.views != "off" and len(self.layout.views) > 1
+        self.rig_can = recipe.rig != "off" and int(self.layout.free.sum()) > 1
+        if not self.views_can and not self.rig_can:
+            self.decided = self._decisions(False, False, "", "")
+
+    @property
+    def choices(self) -> dict[str, Choice[Any]]:
+        return {} if self.decided is None else {"poses": self.decided.views, "rig": self.decided.rig}
 
     def due(self, progress: float) -> bool:
         """Whether it is time for a step, or to decide."""
-        return (self.decided is None or any(self.decided.values())) and progress >= self.next
+        return (self.decided is None or self.decided.any) and progress >= self.next
 
-    def step(self, see: See, progress: float) -> None:
+    def step(self, look: Look, progress: float) -> None:
         """Decide, if that is not done, and move the cameras by what rays of all frames say.
 
         Args:
-            see: rays of the present field, a number of each modality: their residuals and derivatives.
+            look: rays of the present field, a number of each modality: their residuals and derivatives.
         """
         random = np.random.default_rng((self.seed, 3, self.steps))
         rays = max(_AT_ONCE, _PER_VIEW * len(self.layout.views))
         count = -(-rays // _AT_ONCE) if self.decided is not None else max(_DECIDE, -(-rays // _AT_ONCE))
         counts = {n: -(-_AT_ONCE * len(m.origins) // len(self.layout.view)) for n, m in self.measurements.items()}
-        said = poses.equations((see(counts, random) for _ in range(count)), poses.moved(self.layout, self.motions))
+        equations = poses.normal_equations((look(counts, random) for _ in range(count)), poses.moved(self.layout, self.motions))
         self.steps += 1
         self.next = progress + rays / _PER_FIT
-        if not np.isfinite(said.matrix).all() or not said.error.sum() > 0:
+        if not np.isfinite(equations.matrix).all() or not equations.error.sum() > 0:
             return  # nothing can be said now
         if self.decided is None:
-            self._decide(said)
-        assert self.decided is not None
-        views, rig = self.decided["poses"], self.decided["rig"]
-        if not views and not rig:
+            self.decided = self._decide(equations)
+        if not self.decided.any:
             return
-        step, _ = poses.confirmed(said, self.layout, self.motions, views, rig, self.prior)
-        self.motions = poses.advance(self.layout, self.motions, poses.on_the_rig(self.layout, step, views))
-        self._place()
+        views, rig = self.decided.views.value, self.decided.rig.value
+        step, _ = poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)
+        self.motions = poses.advance(self.layout, self.motions, poses.fix_reference(self.layout, step, views))
+        self._set_poses()
 
-    def _decide(self, said: Equations) -> None:
+    def _decide(self, equations: NormalEquations) -> MotionDecisions:
         """By the share of the error of rays not learned from that motions of views save beyond those of sensors, and the reverse."""
-        can, worth = self.possible, self.recipe.poses_worth
-        views, rig, both = (
-            poses.confirmed(said, self.layout, self.motions, v, r, self.prior)[1] if v or r else 0.0
-            for v, r in ((can["poses"], False), (False, can["rig"]), (can["poses"], can["rig"]))
+
+        def saved(views: bool, rig: bool) -> float:
+            if not views and not rig:
+                return 0.0
+            return poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)[1]
+
+        by_views, by_rig, by_both = saved(self.views_can, False), saved(False, self.rig_can), saved(self.views_can, self.rig_can)
+        worth = self.recipe.min_improvement
+        views, rig = by_both - by_rig > worth, by_both - by_views > worth
+        if not views and not rig and max(by_views, by_rig) > worth:
+            views, rig = by_views > by_rig, by_rig >= by_views  # one does as well as the other
+        why = "would save {:.1%} of the error of rays not learned from, and cost {:.0e} rays of the fit"
+        return self._decisions(
+            views, rig, f"motions of views {why.format(by_views, _PER_FIT)}", f"motions of sensors {why.format(by_rig, _PER_FIT)}"
         )
-        wanted = {"poses": both - rig > worth, "rig": both - views > worth}
-        if not any(wanted.values()) and max(views, rig) > worth:
-            wanted = {"poses": views > rig, "rig": rig >= views}  # one does as well as the other
-        said_of = f"would save {{:.1%}} of the error of rays not learned from, and cost {_PER_FIT:.0e} rays of the fit"
-        self._settle(wanted, {"poses": f"motions of views {said_of.format(views)}", "rig": f"motions of sensors {said_of.format(rig)}"})
 
-    def _settle(self, wanted: dict[str, bool], why: dict[str, str]) -> None:
-        self.decided = {}
-        cannot = {"poses": "there is one view", "rig": "no two sensors share views"}
-        for what, asked in (("poses", self.recipe.poses), ("rig", self.recipe.rig)):
-            on = self.possible[what] and (asked == "on" or wanted[what])
-            self.decided[what] = on
-            reason = why[what] if self.possible[what] else cannot[what]
-            if asked == "off" or (asked == "on" and on):
-                reason = "asked for by the recipe" if asked == "off" else f"asked for by the recipe; {reason}"
-            self.evidence[what] = f"{'on' if on else 'off'}: {reason}"
+    def _decisions(self, views: bool, rig: bool, of_views: str, of_rig: str) -> MotionDecisions:
+        """What residuals want, and why, put to what the recipe wants and the scene allows."""
 
-    def _place(self) -> None:
+        def decision(asked: str, can: bool, wanted: bool, why: str) -> Choice[bool]:
+            if asked == "off":
+                return switch(False, "asked for by the recipe")
+            if asked == "on" and can:
+                return switch(True, f"asked for by the recipe; {why}")
+            return switch(can and wanted, why)
+
+        return MotionDecisions(
+            decision(self.recipe.views, self.views_can, views, of_views if self.views_can else "there is one view"),
+            decision(self.recipe.rig, self.rig_can, rig, of_rig if self.rig_can else "no two sensors share views"),
+        )
+
+    def _set_poses(self) -> None:
         now, begin = poses.moved(self.layout, self.motions), 0
         for name in in_order(self.measurements):
             m = self.measurements[name]
-            m.place(now[begin : begin + len(m.origins)])
+            m.set_poses(now[begin : begin + len(m.origins)])
             begin += len(m.origins)
 
     def corrections(self) -> Corrections:
@@ -138,7 +166,7 @@ class Refinement:
         in_world = poses.in_world(layout, self.motions)
         # x_world = radius x + centre, so x → R x + t there is x_world → R x_world + radius t + centre - R centre
         in_world[:, :3, 3] = radius * in_world[:, :3, 3] + centre - in_world[:, :3, :3] @ centre
-        in_sensor = poses.rigid(self.motions.sensors)
+        in_sensor = poses.motion_to_matrix(self.motions.sensors)
         in_sensor[:, :3, 3] *= radius
         views = {v: matrix for v, matrix, m in zip(layout.views, in_world, self.motions.views, strict=True) if m.any()}
         sensors = {n: matrix for n, matrix, m in zip(layout.sensors, in_sensor, self.motions.sensors, strict=True) if m.any()}
@@ -170,15 +198,14 @@ class Refinement:
         return {
             "views": torch.from_numpy(self.motions.views),
             "sensors": torch.from_numpy(self.motions.sensors),
-            "decided": self.decided,
-            "evidence": dict(self.evidence),
+            "decided": None if self.decided is None else asdict(self.decided),
             "steps": self.steps,
             "next": self.next,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.motions = Motions(state["views"].numpy(), state["sensors"].numpy())
-        self.decided, self.evidence = state["decided"], dict(state["evidence"])
+        self.decided = TypeAdapter(MotionDecisions | None).validate_python(state["decided"])
         self.steps, self.next = state["steps"], state["next"]
         if self.steps:
-            self._place()
+            self._set_poses()

@@ -112,7 +112,7 @@ def _finished(trainer: Trainer) -> Field:
     field = trainer.field
     trainer.average.apply()
     last = sampling_at(1.0, trainer.recipe, trainer.needs)
-    field.sampling = last._replace(step=last.step * trainer.recipe.rendered_step)
+    field.sampling = last._replace(step=last.step * trainer.recipe.sampling.rendered_step_factor)
     field.occupancy.update(
         lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
     )

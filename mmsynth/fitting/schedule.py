@@ -11,9 +11,9 @@ from mmsynth.fitting.recipe import Recipe
 
 def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     """Sharpness grows exponentially to its end, the step follows it, and grid levels open one by one."""
-    grown = min(1.0, progress / recipe.sharpness_until)
-    sharpness = recipe.sharpness_start * (needs.sharpness_end / recipe.sharpness_start) ** grown
-    opened = min(1.0, progress / recipe.levels_until)
+    grown = min(1.0, progress / recipe.schedule.sharpness_until)
+    sharpness = recipe.schedule.sharpness_start * (needs.sharpness_end / recipe.schedule.sharpness_start) ** grown
+    opened = min(1.0, progress / recipe.schedule.levels_until)
 
     def active(levels: int) -> int:
         first = min(2, levels)
@@ -23,11 +23,11 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     return Sampling(
         sharpness=sharpness,
         # at the default, two steps across the soft surface (its width is about 3.5 / s); never coarser than a tenth of the radius
-        step=min(0.1, recipe.step_width / sharpness),
-        sphere_step_factor=recipe.stride,
-        min_slope=recipe.grazing,
-        max_optical_depth=recipe.opaque,
-        min_section_weight=recipe.significant,
+        step=min(0.1, recipe.sampling.step_width / sharpness),
+        sphere_step_factor=recipe.sampling.sphere_step_factor,
+        min_slope=recipe.sampling.min_slope,
+        max_optical_depth=recipe.sampling.max_optical_depth,
+        min_section_weight=recipe.sampling.min_section_weight,
         active_surface=active(design.surface_levels),
         active_radiance=active(design.radiance_levels),
     )
@@ -39,11 +39,11 @@ def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
     A step of Adam moves the surface by about its rate, whatever the gradient. Where that is a good part of the soft surface,
     the surface never comes to rest: colours blur, and views stop to agree.
     """
-    return min(1.0, recipe.learning_rate_sharpness / sharpness)
+    return min(1.0, recipe.schedule.full_rate_sharpness / sharpness)
 
 
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:
     """A short linear rise, then level, then exponential decay over the last two thirds."""
     rise = min(1.0, progress / 0.01)
     fall = max(0.0, (progress - 0.33) / 0.67)
-    return max(rise, 0.02) * math.exp(math.log(recipe.learning_rate_end) * fall)
+    return max(rise, 0.02) * math.exp(math.log(recipe.schedule.learning_rate_end_factor) * fall)

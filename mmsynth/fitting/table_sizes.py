@@ -3,15 +3,48 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
 from mmsynth.field.field import Field
-from mmsynth.field.kernels import SHELL
+from mmsynth.field.kernels import SHELL, Sampling
+from mmsynth.fitting.choices import Choice
+from mmsynth.fitting.recipe import RadianceRecipe, Recipe, SurfaceRecipe
 
-_LEAST = 12
+_LEAST = 12  # log2 of rows
 _PROBES = 65536
 _CROSSED = 0.75  # of a cell's size: mean distance within which a plane crosses a cube, (|n_x| + |n_y| + |n_z|) / 2 over all n
+
+
+@dataclass(frozen=True)
+class TableSizes:
+    """log2 of the most rows of every level of the surface's and of the radiance's table.
+
+    Attributes:
+        first: levels of the two that are the first to have another size: those before them were in use.
+    """
+
+    surface: tuple[int, ...]
+    radiance: tuple[int, ...]
+    first: tuple[int, int]
+    choice: Choice[tuple[int, int]]
+
+
+def size_tables(field: Field, recipe: Recipe, sampling: Sampling, generator: torch.Generator) -> TableSizes:
+    """Rows for the levels that are not yet active: as many as the cells at the surface, as it is now, ask for."""
+    most = int(field.design.surface_rows_log2), int(field.design.radiance_rows_log2)  # type: ignore[arg-type]  # all levels alike
+    grids: tuple[SurfaceRecipe | RadianceRecipe, ...] = recipe.surface, recipe.radiance
+    first = sampling.active_surface, sampling.active_radiance
+    cells = cells_at_surface(field, sampling.active_surface, generator)
+    rows = [rows_log2(n / grid.cells_per_row, m) for n, grid, m in zip(cells, grids, most, strict=True)]
+    why = ", ".join(
+        f"{name} 2^{r} for {n:.2g} cells" + (" (by the rays to come or the recipe no more)" if r == m else "")
+        for name, r, m, n in zip(("surface", "radiance"), rows, most, cells, strict=True)
+    )
+    surface, radiance = ((m,) * a + (r,) * (grid.levels - a) for m, r, a, grid in zip(most, rows, first, grids, strict=True))
+    why = f"rows for each of the finer levels, cells of the finest at the surface: {why}"
+    return TableSizes(surface, radiance, first, Choice((rows[0], rows[1]), why, tuple(rows) != most))
 
 
 @torch.no_grad()

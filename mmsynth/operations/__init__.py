@@ -1,1 +1,1 @@
-"""What is made of a field, a folder each."""
+"""What is made of a field, a folder each; ``output`` and ``views`` are shared by the others."""

@@ -1,1 +1,1 @@
-"""Results to look at: ``report.html`` of a run, and tables in the terminal."""
+"""Results to look at: ``report`` writes the HTML page of a run, ``text`` prints tables in the terminal."""

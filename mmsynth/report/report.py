@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_text
+from mmsynth.fitting.choices import choices_of
 from mmsynth.operations.output import previews
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor
@@ -125,8 +126,10 @@ def _source(image: np.ndarray) -> str:
 
 
 def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
-    """A frame with all channels at every pixel (H, W, C), demosaicked for display."""
-    pixels, _ = load_frame(sensor, frame)
+    """A frame with all channels at every pixel (H, W, C), demosaicked for display; times its alpha, as it is fitted and scored."""
+    pixels, alpha = load_frame(sensor, frame)
+    if alpha is not None:
+        pixels = pixels * alpha[..., None]
     if sensor.mosaic is not None and is_bayer(sensor.mosaic):
         return np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
     return channels_of(pixels, sensor.mosaic)
@@ -236,7 +239,9 @@ def write_run_report(
     region = field.region
     centre = ", ".join(f"{c:.4g}" for c in region.centre)
     facts = _flat({key: manifest[key] for key in _RUN_FACTS if key in manifest})
-    needed = _flat(needs.get("evidence", {})) + _flat({k: v for k, v in needs.items() if k != "evidence"})
+    needed = [(name, choice.why) for name, choice in choices_of(manifest).items()] + _flat(
+        {k: v for k, v in needs.items() if k != "choices"}
+    )
     page = {
         "title": f"mmsynth: {name}",
         "subtitle": f"{len(field.sensors)} modalities: {', '.join(field.sensors)}. "

@@ -20,6 +20,16 @@ _COLUMNS = {
 }
 
 
+def fit_text(facts: Mapping[str, Any]) -> str:
+    """What a fit came to (``Run.facts``): length, speed, PSNR on training pixels, and where it is."""
+    psnr = ", ".join(f"{n} {v:.1f}" for n, v in facts["train_psnr"].items())
+    return (
+        f"{facts['steps']} steps in {facts['seconds']['fit']:.0f} s, {facts['rays_per_s']:,.0f} rays/s\n"
+        f"PSNR on training pixels [dB]: {psnr}\n"
+        f"wrote {facts['run']}/ (field.safetensors, manifest.json, preview.png, report.html)"
+    )
+
+
 def score_text(scores: Mapping[str, Any]) -> str:
     """The result of ``evaluate`` as lines: one row per modality, then geometry and speed."""
     modalities: Mapping[str, Mapping[str, Any]] = scores["modalities"]

@@ -1,4 +1,4 @@
-"""What a scene really is, where its ``gt`` folder says: noise-free light, geometry, regions."""
+"""Ground truth of a scene, from its ``gt`` folder: noise-free radiance, geometry, regions."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from mmsynth.scene.scene import Frame, Scene, Sensor
 from mmsynth.sensors.camera import Camera, round_trip_error
 
 
-def describe(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
+def describe_scene(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
     """Summarise a scene as a JSON-serialisable dictionary.
 
     Every image file is checked to be complete; pixel statistics come from at most ``measured_frames`` frames per sensor, evenly
@@ -136,7 +136,7 @@ def _add(problems: list[str], error: InputError) -> None:
 
 
 def render_text(description: dict[str, Any]) -> str:
-    """The dictionary of ``describe`` as plain text, some lines per sensor."""
+    """The dictionary of ``describe_scene`` as plain text, some lines per sensor."""
     region, split = description["region"], description["split"]
     lines = [
         f"{description['scene']}  ({description['format']})",

@@ -1,26 +1,31 @@
-"""Read a scene of any known format, and refuse one that nothing can be learned from."""
+"""Read a scene, or poses, of any known layout; refuse a scene that nothing can be learned from."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.files import read_json
+from mmsynth.scene.checks import rigid_pose
+from mmsynth.scene.layouts.colmap import read_images_txt
 from mmsynth.scene.layouts.middlebury import read_middlebury
-from mmsynth.scene.layouts.mmsdata import read_mmsdata
-from mmsynth.scene.layouts.nerfstudio import read_nerfstudio
-from mmsynth.scene.scene import Frame, Region, Scene
+from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_reference_poses
+from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_transforms
+from mmsynth.scene.layouts.tum import is_tum, read_tum
+from mmsynth.scene.scene import Frame, Region, Scene, StatedPose
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 
 _ROUND_TRIP = 1e-3  # pixels
 
 
-def load_scene(path: Path | str, modalities: Sequence[str] | None = None) -> Scene:
-    """Read a scene; the format is told by what the folder holds.
+def load_scene(path: Path | str, *, modalities: Sequence[str] | None = None) -> Scene:
+    """Read a scene; its layout is recognised by the files in the folder.
 
     ``meta_data.json``: MMS-DATA; ``transforms.json``: nerfstudio or instant-ngp; ``*_par.txt``: Middlebury.
 
@@ -72,6 +77,59 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str] | None], Scene]:
     if (path / "calibration.json").is_file():
         raise InputError(f"{path}: calibration.json without meta_data.json is an MMS-DATA source scene, which has no camera poses.")
     raise InputError(f"{path}: not a scene, expected meta_data.json (MMS-DATA), transforms.json (nerfstudio) or *_par.txt (Middlebury).")
+
+
+def read_poses(path: Path) -> list[StatedPose]:
+    """Read the poses to render from, in file order.
+
+    Accepted:
+
+    * nerfstudio ``transforms.json`` (OpenGL axes);
+    * nerfstudio ``camera_path.json`` (OpenGL axes, vertical field of view in degrees, square pixels, no distortion; its poses are
+      taken to be in the scene's frame);
+    * MMS-DATA ``meta_data.json``: the poses of its first modality, in the frame and unit in which the scene is read;
+    * COLMAP ``images.txt`` (with ``cameras.txt`` beside it if there), or a folder that holds it;
+    * TUM, ``.tum`` or ``.txt``: lines ``t tx ty tz qx qy qz qw``, camera to world, OpenCV axes; no intrinsics. The name of a pose is
+      its time as the file spells it. A ``.txt`` of another name than ``images.txt`` is TUM when its first line has at most eight values;
+    * ``{"convention": "OpenCV ...", "rig": [4x4, ...]}`` (OpenCV axes).
+
+    Raises:
+        InputError: missing or unknown file, no pose in it, or a pose that is not finite and rigid.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "images.txt"
+    if is_tum(path):
+        poses = read_tum(path)
+    elif path.suffix.lower() == ".txt":
+        poses = read_images_txt(path)
+    else:
+        content = read_json(path)
+        if not isinstance(content, dict):
+            kind = type(content).__name__
+            raise InputError(f"{path}: a JSON {kind}, expected an object with 'frames', 'camera_path', 'modalities' or 'rig'.")
+        if "frames" in content:
+            poses = read_transforms(content, path)
+        elif "camera_path" in content:
+            poses = read_camera_path(content, path)
+        elif "modalities" in content:
+            poses = read_reference_poses(path)
+        elif "rig" in content:
+            poses = _read_matrices(content, path)
+        else:
+            raise InputError(f"{path}: none of the keys 'frames' (transforms.json), 'camera_path', 'modalities' (MMS-DATA) or 'rig' found.")
+    if not poses:
+        raise InputError(f"{path}: no poses in it, expected at least one.")
+    return poses
+
+
+def _read_matrices(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
+    convention = str(content.get("convention", "OpenCV"))
+    if "opencv" not in convention.lower():
+        raise InputError(f"{path}: key 'convention' is '{convention}', expected OpenCV axes (x right, y down, z forward).")
+    if not isinstance(content["rig"], list):
+        raise InputError(f"{path}: key 'rig' is not a list of 4x4 matrices.")
+    return [StatedPose(None, rigid_pose(matrix, f"{path}: pose {index}"), f"{index:04d}") for index, matrix in enumerate(content["rig"])]
 
 
 def sees(frame: Frame, region: Region) -> bool:

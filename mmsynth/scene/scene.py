@@ -13,11 +13,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.sensors.camera import Camera
+
+Layout = Literal["MMS-DATA", "nerfstudio", "Middlebury"]
+
+MAX_VIEW = 999_999_999  # ids of views are whole numbers from 0
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""camera_to_world in OpenGL axes (y up, z back) times this = in OpenCV axes."""
 
 ALIASES = {
     "infrared": "nir", "polarization": "pol", "polarisation": "pol", "multispectral": "ms",
@@ -74,6 +81,15 @@ class PosedCamera:
     camera: Camera
     camera_to_world: np.ndarray
     name: str = ""
+
+
+@dataclass(frozen=True)
+class StatedPose:
+    """A pose as a file states it: a ``PosedCamera`` whose camera is None where the file has no intrinsics."""
+
+    camera: Camera | None
+    camera_to_world: np.ndarray
+    name: str
 
 
 @dataclass(frozen=True)
@@ -148,7 +164,7 @@ class Scene:
     """
 
     root: Path
-    format: str
+    format: Layout
     sensors: dict[str, Sensor]
     frames: tuple[Frame, ...]
     region: Region

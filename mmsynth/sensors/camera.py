@@ -19,7 +19,12 @@ from mmsynth.errors import InputError
 from mmsynth.sensors import lenses
 
 Lens = Literal["brown_conrady", "kannala_brandt"]
-COEFFICIENTS: dict[str, int] = {"brown_conrady": 8, "kannala_brandt": 4}
+COEFFICIENTS: dict[str, tuple[str, ...]] = {
+    "brown_conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "kannala_brandt": ("k1", "k2", "k3", "k4"),
+}
+"""Their names, in order."""
+MAX_SIZE = 1_000_000  # pixels: ten times the largest panoramas
 _ON_AXIS = 1e-4  # tan θ below which a fisheye's r_d / r is taken from its series: the next term is 1e-16
 
 
@@ -50,8 +55,8 @@ class Camera:
             raise InputError(
                 f"distortion: {len(self.distortion)} coefficients, expected 0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6."
             )
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"camera: size {self.width}x{self.height}, expected at least 1x1 pixel.")
+        if not (1 <= self.width <= MAX_SIZE and 1 <= self.height <= MAX_SIZE):
+            raise InputError(f"camera: size {self.width}x{self.height}, expected at least 1x1 pixel, at most {MAX_SIZE} a side.")
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
             raise InputError(
@@ -66,7 +71,7 @@ class Camera:
     @property
     def coefficients(self) -> np.ndarray:
         """(8,) or, of a fisheye, (4,) distortion, zero-padded."""
-        return np.array(self.distortion + (0.0,) * (COEFFICIENTS[self.lens] - len(self.distortion)))
+        return np.array(self.distortion + (0.0,) * (len(COEFFICIENTS[self.lens]) - len(self.distortion)))
 
     @property
     def intrinsics(self) -> np.ndarray:
@@ -193,7 +198,7 @@ def depth_along_rays(camera: Camera, depth_z: np.ndarray) -> np.ndarray:
 
 
 def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:
-    """How well rays of pixels (N, 2) come back.
+    """How well the inverse of the lens model works at pixels (N, 2).
 
     Returns:
         the largest distance [px] between a pixel and the projection of its ray in float32, as rays are cast (NaN where no pixel has

@@ -120,6 +120,7 @@ def record(light: Tensor, model: NoiseModel, frames: Sequence[int], sensor: str,
 
 def _share_with_neighbours(electrons: Tensor, share: float) -> Tensor:
     """(B, H, W): each of the four neighbours gets a share; what would leave the frame stays."""
+    from kornia.filters import filter2d  # a second to import
+
     kernel = electrons.new_tensor([[0.0, share, 0.0], [share, 1.0 - 4.0 * share, share], [0.0, share, 0.0]])
-    padded = torch.nn.functional.pad(electrons[:, None], (1, 1, 1, 1), mode="replicate")
-    return torch.nn.functional.conv2d(padded, kernel[None, None])[:, 0]
+    return filter2d(electrons[:, None], kernel[None], border_type="replicate")[:, 0]

@@ -195,9 +195,9 @@ def resample_stokes(image: Tensor, pixels: Tensor, turn: Tensor) -> Tensor:
     Returns:
         (B, 3, H', W'), 0 (no light) outside of the image. Differentiable.
     """
-    size = pixels.new_tensor([image.shape[-1], image.shape[-2]])
-    grid = (2.0 * pixels + 1.0) / size - 1.0
-    found = torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    from kornia.geometry.transform import remap  # a second to import
+
+    found = remap(image, pixels[..., 0], pixels[..., 1], align_corners=True)
     return rotate_stokes(found.movedim(1, -1), turn).movedim(-1, 1)
 
 

@@ -33,14 +33,15 @@ def blur(light: Tensor, sigma: float) -> Tensor:
     """Gaussian blur of (..., H, W), ``sigma`` in pixels of the grid, the border repeated."""
     if sigma == 0.0:
         return light
+    from kornia.filters import filter2d_separable  # a second to import
+
     radius = blur_radius(sigma)
     at = torch.arange(-radius, radius + 1, dtype=light.dtype, device=light.device)
-    # the mean of the Gaussian over each pixel: right for narrow ones, too
+    # the mean of the Gaussian over each pixel: kornia's samples it, which is 0.15 of full scale off at sigma = 0.3
     edges = torch.special.erf((torch.cat([at - 0.5, at[-1:] + 0.5])) / (sigma * 2.0**0.5))
     kernel = edges.diff() / (edges[-1] - edges[0])
     flat = light.reshape(-1, 1, *light.shape[-2:])
-    flat = nn.functional.conv2d(nn.functional.pad(flat, (radius, radius, radius, radius), mode="replicate"), kernel[None, None, :, None])
-    return nn.functional.conv2d(flat, kernel[None, None, None, :]).reshape(light.shape)
+    return filter2d_separable(flat, kernel[None], kernel[None], border_type="replicate").reshape(light.shape)
 
 
 def aperture(light: Tensor, supersampling: int) -> Tensor:

@@ -1,1 +1,4 @@
-"""Whole jobs that join several rooms: many scenes, a fit and a dataset of each."""
+"""Whole jobs that join several rooms.
+
+Start with ``fit`` (a fit with its report) and ``runs`` (opening a run again); ``batch`` fits many scenes and makes a dataset of each.
+"""

@@ -13,9 +13,9 @@ from mmsynth.field.field import Field
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
-from mmsynth.operations.dataset.generate import generate_dataset
-from mmsynth.operations.output.work_partition import Share, local_device
-from mmsynth.operations.views.trajectories import load_views
+from mmsynth.operations.dataset.generate import DatasetFormat, generate_dataset
+from mmsynth.operations.output.work_partition import WorkPartition, local_device
+from mmsynth.operations.views.load import Rig
 from mmsynth.report.report import write_run_report
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
@@ -27,8 +27,8 @@ class Job:
 
     Attributes:
         recipe: of the fits. steps, seconds: their length, one of the two or neither (the recipe's). modalities: names, None: all.
-        poses: for ``load_views``, None: no datasets; a file that is not there is sought in each scene's folder. rig, format: of the
-            datasets.
+        poses: for ``generate_dataset``, None: no datasets; a file that is not there is sought in each scene's folder. rig, file_format: of
+            the datasets.
     """
 
     recipe: Recipe
@@ -38,8 +38,8 @@ class Job:
     device: str = "cpu"
     modalities: tuple[str, ...] | None = None
     poses: Path | None = None
-    rig: str = "aligned"
-    format: str = "npz"
+    rig: Rig = "aligned"
+    file_format: DatasetFormat = "npz"
 
 
 def read_scene_list(path: Path) -> list[Path]:
@@ -64,19 +64,19 @@ def read_scene_list(path: Path) -> list[Path]:
 
 
 def run_batch(
-    scenes: Sequence[Path], out: Path, job: Job, share: Share | None = None, say: Callable[[str], None] = lambda text: None
+    scenes: Sequence[Path], out: Path, job: Job, part: WorkPartition | None = None, say: Callable[[str], None] = lambda text: None
 ) -> dict[str, dict[str, Any]]:
     """Fit every scene and make its dataset, into ``<out>/NAME/run`` and ``<out>/NAME/dataset``; NAME/outcome.json says how it went.
 
     What is finished is not made again, what was cut off goes on.
 
     Args:
-        share: the scenes of this process, None: all. say: told a line per scene.
+        part: the scenes of this process, None: all. say: told a line per scene.
     Returns:
         by name, what outcome.json holds: "run", "dataset", "seconds", "train_psnr", or "error", the sentence of the scene that failed.
     """
     outcomes = {}
-    for index in (share or Share()).of(len(scenes)):
+    for index in (part or WorkPartition()).of(len(scenes)):
         scene, name = scenes[index], scenes[index].resolve().name
         began = time.perf_counter()
         try:
@@ -95,13 +95,15 @@ def run_batch(
 
 
 def _one(path: Path, out: Path, job: Job) -> dict[str, Any]:
-    scene = load_scene(path, job.modalities)
+    scene = load_scene(path, modalities=job.modalities)
     run = out / "run"
     field = _fitted(scene, run, job)
     made = None
     if job.poses is not None:
-        poses = job.poses if job.poses.exists() else scene.root / job.poses
-        made = generate_dataset(field, load_views(poses, field, scene), out / "dataset", rig=job.rig, format=job.format)
+        outputs = ["geometry", "flow"]
+        made = generate_dataset(
+            field, job.poses, out / "dataset", scene=scene, rig=job.rig, file_format=job.file_format, outputs=outputs
+        ).path
     return {"run": str(run), "dataset": None if made is None else str(made), "train_psnr": field.manifest["train_psnr"]}
 
 

@@ -22,7 +22,7 @@ from mmsynth.scene.load import load_scene
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = str(data_folder("example_scene"))
-JOB = Job("one", EXAMPLE, Recipe.model_validate({}), ("rgb", "pol"), {"pol": 3}, 0, 4, None)
+JOB = Job("one", EXAMPLE, Recipe(), ("rgb", "pol"), {"pol": 3}, 0, 4, None)
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_a_result_that_is_there_is_not_made_again(fits: list[str], tmp_path: Pat
         {"device": "cuda"},
         {"steps": 5},
         {"steps": None, "budget": 4.0},
-        {"recipe": Recipe.model_validate({"eikonal": 0.3})},
+        {"recipe": Recipe().with_changes({"loss.eikonal_weight": 0.3})},
         {"modalities": None},
         {"frames": {"pol": 2}},
     ],
@@ -137,7 +137,8 @@ def test_a_broken_result_is_named(fits: list[str], tmp_path: Path) -> None:
 
 
 def test_the_scene_hash_covers_pixels_and_poses(write_mmsdata: Any) -> None:
-    from mmsynth.scene.images import read_native, write_png16
+    from mmsynth.scene.image_writers import write_png16
+    from mmsynth.scene.images import read_native
 
     root = write_mmsdata()
     before = scene_hash(load_scene(root))

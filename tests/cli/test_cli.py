@@ -110,6 +110,7 @@ def test_every_public_name_is_there() -> None:
     import mmsynth
 
     assert all(callable(getattr(mmsynth, name)) for name in mmsynth.__all__)
+    assert set(mmsynth.__all__) == set(mmsynth._HOMES)
 
 
 def test_convert_at_poses(fitted: Path, tmp_path: Path) -> None:
@@ -364,3 +365,8 @@ def test_a_full_disk_leaves_nothing_half_written(fitted: Path, tmp_path: Path) -
         refused(run(fitted, *args, largest_file=20_000), "could not be written")
     assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.suffix != ".json" and p.stat().st_size == 20_000]
     assert not list(tmp_path.rglob("*tmp*"))
+
+
+def test_importing_sets_no_environment_variable() -> None:
+    code = "import os, cv2, torch; before = dict(os.environ); import mmsynth; mmsynth.load_scene; assert dict(os.environ) == before"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

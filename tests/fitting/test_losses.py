@@ -122,8 +122,8 @@ def test_every_number_is_of_the_pixel_its_ray_goes_through(batch: Batch, frames:
 def test_levels_saturations_and_weights_are_the_modalitys(batch: Batch, measurements: dict[str, Measurements]) -> None:
     for name, (_, numbers) in batch.parts.items():
         m = measurements[name]
-        assert (batch.level[numbers] == np.float32(m.level)).all()
-        assert m.level == pytest.approx(BRIGHTNESS[name] / 2, rel=0.05)
+        assert (batch.level[numbers] == np.float32(m.radiance_scale)).all()
+        assert m.radiance_scale == pytest.approx(BRIGHTNESS[name] / 2, rel=0.05)
         assert (batch.saturation[numbers] == np.float32(m.sensor.saturation)).all()
     assert float(batch.weight.sum()) == pytest.approx(1.0)
 

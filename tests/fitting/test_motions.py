@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from mmsynth.fitting import motions as poses
-from mmsynth.fitting.motions import Layout, Motions, Rows
+from mmsynth.fitting.motions import Layout, Motions, RayJacobian
 from mmsynth.scene.scene import Frame, Region
 from mmsynth.sensors.camera import Camera
 
@@ -27,7 +27,7 @@ REGION = Region((1.0, -2.0, 0.5), 2.0)
 def _layout(views: int = VIEWS, missing: tuple[tuple[str, int], ...] = ()) -> Layout:
     camera = Camera(80, 60, FOCAL, FOCAL, 39.5, 29.5)
     random = np.random.default_rng(0)
-    offsets = poses.rigid(0.1 * random.normal(size=(len(SENSORS), 6)))
+    offsets = poses.motion_to_matrix(0.1 * random.normal(size=(len(SENSORS), 6)))
     frames = []
     for s, sensor in enumerate(SENSORS):
         for v, pose in enumerate(ring(views, radius=6.0, height=2.0)):
@@ -64,22 +64,22 @@ class Points:
         self.away = np.linalg.norm(self.points - at, axis=1, keepdims=True)
         self.in_camera = np.einsum("nji,nj->ni", turn, (self.points - at) / self.away)
 
-    def see(self, now: np.ndarray) -> Rows:
+    def see(self, now: np.ndarray) -> RayJacobian:
         at, turn = now[self.frame, :3, 3], now[self.frame, :3, :3]
         directions = np.einsum("nij,nj->ni", turn, self.in_camera)
         residual = np.einsum("ni,ni->n", self.across, at + directions * self.away - self.points) + self.noise
         order = np.random.default_rng(3).permutation(len(self.frame))  # both halves see every frame
         rows = (self.frame, residual, self.across, self.across * self.away, directions)
-        return Rows(*(torch.from_numpy(x[order]) for x in rows))
+        return RayJacobian(*(torch.from_numpy(x[order]) for x in rows))
 
 
 def _solved(layout: Layout, field: Points, views: bool, rig: bool, steps: int = 12) -> Motions:
     motions = _still(layout)
     for _ in range(steps):
         now = poses.moved(layout, motions)
-        said = poses.equations([field.see(now)], now)
-        step, _ = poses.confirmed(said, layout, motions, views, rig, prior=1.0)
-        motions = poses.advance(layout, motions, poses.on_the_rig(layout, step, views))
+        equations = poses.normal_equations([field.see(now)], now)
+        step, _ = poses.cross_validated_step(equations, layout, motions, views, rig, prior=1.0)
+        motions = poses.advance(layout, motions, poses.fix_reference(layout, step, views))
     return motions
 
 
@@ -92,7 +92,7 @@ def _off(layout: Layout, motions: Motions, true: np.ndarray) -> float:
 
 @given(arrays(float, (5, 6), elements=st.floats(-1, 1)))
 def test_motions_and_matrices_are_each_others_inverse(motion: np.ndarray) -> None:
-    assert poses.motion_of(poses.rigid(motion)) == pytest.approx(motion, abs=1e-12)
+    assert poses.matrix_to_motion(poses.motion_to_matrix(motion)) == pytest.approx(motion, abs=1e-12)
 
 
 def test_the_derivative_is_the_limit_of_differences() -> None:
@@ -103,7 +103,7 @@ def test_the_derivative_is_the_limit_of_differences() -> None:
     for i in range(6):
         step = np.zeros((len(layout.poses), 6))
         step[:, i] = 1e-5
-        there, back = (field.see(layout.poses @ poses.rigid(s)).residual.numpy() for s in (step, -step))
+        there, back = (field.see(layout.poses @ poses.motion_to_matrix(s)).residual.numpy() for s in (step, -step))
         assert analytic[:, i] == pytest.approx((there - back) / 2e-5, abs=1e-8)
 
 
@@ -134,10 +134,10 @@ def test_relative_poses_are_exact_up_to_a_similarity() -> None:
 def test_noise_alone_moves_nothing() -> None:
     layout = _layout()
     now = layout.poses
-    said = poses.equations([Points(layout, now, noise=0.05).see(now)], now)
+    equations = poses.normal_equations([Points(layout, now, noise=0.05).see(now)], now)
     for views, rig in ((True, False), (False, True), (True, True)):
-        step, saved = poses.confirmed(said, layout, _still(layout), views, rig, prior=1.0)
-        alone = poses.solve(said.both(), layout, _still(layout), views, rig, prior=1.0)
+        step, saved = poses.cross_validated_step(equations, layout, _still(layout), views, rig, prior=1.0)
+        alone = poses.solve(equations.both(), layout, _still(layout), views, rig, prior=1.0)
         assert abs(saved) < 0.005
         # what least squares alone would do to fit the noise
         assert np.abs(step.views).max() + np.abs(step.sensors).max() < 0.35 * (np.abs(alone.views).max() + np.abs(alone.sensors).max())
@@ -147,8 +147,8 @@ def test_a_motion_beside_noise_is_found_as_far_as_it_stands_out() -> None:
     layout = _layout()
     true = poses.moved(layout, _motions(layout, 0.01))
     field = Points(layout, true, noise=0.02)
-    said = poses.equations([field.see(layout.poses)], layout.poses)
-    _, saved = poses.confirmed(said, layout, _still(layout), True, True, prior=1.0)
+    equations = poses.normal_equations([field.see(layout.poses)], layout.poses)
+    _, saved = poses.cross_validated_step(equations, layout, _still(layout), True, True, prior=1.0)
     assert 0.05 < saved < 1.0
     assert _off(layout, _solved(layout, field, True, True), true) < 0.5 * _off(layout, _still(layout), true)
 
@@ -161,7 +161,7 @@ def test_a_similarity_of_all_views_is_no_motion() -> None:
     anchors = layout.poses[layout.anchor]
     now = similar @ anchors
     now[:, :3, 3] *= 1.002
-    step = poses.motion_of(np.linalg.inv(anchors) @ now)
+    step = poses.matrix_to_motion(np.linalg.inv(anchors) @ now)
     left = poses.advance(layout, _still(layout), Motions(step, np.zeros((3, 6))))
     assert np.abs(left.views).max() < 0.01 * np.abs(step).max()
 
@@ -173,9 +173,9 @@ def test_frames_without_rays_follow_their_view_and_sensor_and_lone_ones_stay() -
     lone = int(layout.anchor[3])
     rows = field.see(layout.poses)
     keep = rows.frame != lone
-    some = Rows(*(x[keep] for x in (rows.frame, rows.residual, rows.by_origin, rows.by_direction, rows.directions)))
-    said = poses.equations([some], layout.poses)
-    step, saved = poses.confirmed(said, layout, _still(layout), True, True, prior=1.0)
+    some = RayJacobian(*(x[keep] for x in (rows.frame, rows.residual, rows.by_origin, rows.by_direction, rows.directions)))
+    equations = poses.normal_equations([some], layout.poses)
+    step, saved = poses.cross_validated_step(equations, layout, _still(layout), True, True, prior=1.0)
     assert saved > 0.5 and np.isfinite(step.views).all() and np.isfinite(step.sensors).all()
     assert not step.views[3].any() and step.views[4].any()
 
@@ -194,8 +194,8 @@ def test_a_small_motion_of_the_anchor_carries_its_frames(direction: np.ndarray) 
     m = 1e-5 * direction
     frame = 2 * VIEWS + 4  # sensor c, view 4
     anchor = layout.poses[layout.anchor[4]]
-    exact = np.linalg.inv(layout.poses[frame]) @ anchor @ poses.rigid(m[None])[0] @ np.linalg.inv(anchor) @ layout.poses[frame]
-    assert poses.motion_of(exact[None])[0] == pytest.approx(layout.carry[2] @ m, abs=1e-8)
+    exact = np.linalg.inv(layout.poses[frame]) @ anchor @ poses.motion_to_matrix(m[None])[0] @ np.linalg.inv(anchor) @ layout.poses[frame]
+    assert poses.matrix_to_motion(exact[None])[0] == pytest.approx(layout.adjoint[2] @ m, abs=1e-8)
 
 
 def test_pixels_measure_displacement_in_the_picture() -> None:
@@ -208,5 +208,5 @@ def test_pixels_measure_displacement_in_the_picture() -> None:
         seen = (ball - pose[:3, 3]) @ pose[:3, :3]
         return FOCAL * seen[:, :2] / seen[:, 2:]
 
-    moved = np.square(picture(layout.poses[0] @ poses.rigid(m[None])[0]) - picture(layout.poses[0])).sum(1).mean()
+    moved = np.square(picture(layout.poses[0] @ poses.motion_to_matrix(m[None])[0]) - picture(layout.poses[0])).sum(1).mean()
     assert m @ layout.pixels[0] @ m == pytest.approx(moved, rel=0.15)  # of angles, and of fourteen points

@@ -19,8 +19,8 @@ from mmsynth.scene.scene import Scene, keep_frames
 
 SIZE, FOCAL, VIEWS = 36, 48.0, 14
 SMALL = {
-    "samples_per_step": 4096, "rays_at_start": 256, "surface_rows_log2": 12, "radiance_rows_log2": 13, "occupancy_resolution": 24,
-    "eikonal_points": 128, "radiance_hidden": 32, "view_dependence_from": 0.2,
+    "sampling.samples_per_step": 4096, "sampling.initial_rays": 256, "surface.max_rows_log2": 12, "radiance.max_rows_log2": 13,
+    "sampling.occupancy_resolution": 24, "loss.eikonal_points": 128, "radiance.hidden_width": 32, "schedule.view_dependence_from": 0.2,
 }  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def _scene(folder: Path, gloss: float = 0.0, room: float = 0.0, gains: np.ndarra
 
 
 def _fitted(scene: Scene, steps: int = 260, **recipe: object) -> Trainer:
-    trainer = Trainer(scene, Recipe.model_validate({**SMALL, **recipe}), steps, None, 0, "cpu")
+    trainer = Trainer(scene, Recipe().with_changes({**SMALL, **recipe}), steps, None, 0, "cpu")
     while trainer.progress < 1:
         trainer.run_step()
     return trainer
@@ -76,20 +76,20 @@ def _fitted(scene: Scene, steps: int = 260, **recipe: object) -> Trainer:
 def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> None:
     trainer = _fitted(_scene(tmp_path / "s"))
     assert not trainer.needs.design.background and trainer.field.surface.grid.extent == 1.0
-    assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.evidence
-    assert trainer.gains() == {}, trainer.needs.evidence
-    assert trainer.needs.scarce == ()
-    assert trainer.field.far_light is None and trainer.needs.evidence["beyond"].startswith("off")
+    assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.choices
+    assert trainer.gains() == {}, trainer.needs.choices
+    assert trainer.needs.sparse == ()
+    assert trainer.field.far_light is None and trainer.needs.choices["far_light"].why.startswith("off")
     assert trainer.field.shader.heads.out_features == 3  # no tensor head
-    assert trainer.needs.evidence["tensor_head"].startswith("off")
+    assert trainer.needs.choices["tensor_head"].why.startswith("off")
     assert trainer.report().psnr["rgb"] > 25  # the decisions are about a fit that works
 
 
 def test_a_glossy_ball_in_a_painted_room_gets_what_it_needs(tmp_path: Path) -> None:
     trainer = _fitted(_scene(tmp_path / "s", gloss=0.5, room=1.0))
     assert trainer.needs.design.background and trainer.field.surface.grid.extent == 2.0
-    assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.evidence
-    assert trainer.gains() == {}, trainer.needs.evidence
+    assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.choices
+    assert trainer.gains() == {}, trainer.needs.choices
 
 
 def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
@@ -105,9 +105,9 @@ def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
 
 def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) -> None:
     scene = _scene(tmp_path / "s", room=0.2)
-    trainer, without = _fitted(scene), _fitted(scene, beyond="off")
-    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.needs.evidence
-    assert without.field.far_light is None and "asked for by the recipe" in without.needs.evidence["beyond"]
+    trainer, without = _fitted(scene), _fitted(scene, **{"radiance.far_light": "off"})
+    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.needs.choices
+    assert without.field.far_light is None and "asked for by the recipe" in without.needs.choices["far_light"].why
     assert _past_the_ball(trainer, scene) < 0.5 * _past_the_ball(without, scene)
     # and it is still known after it was stored
     trainer.field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
@@ -120,47 +120,49 @@ def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) 
 def test_frames_of_different_exposure_get_gains_and_the_gains_are_right(tmp_path: Path) -> None:
     gains = np.exp(0.25 * np.sin(1.7 * np.arange(VIEWS)))
     scene = _scene(tmp_path / "s", gains=gains)
-    trainer = _fitted(scene, decide_at=0.3, learning_rate_exposure=5e-3, initial_radius=0.15)  # near the ball: a short fit
+    trainer = _fitted(
+        scene, **{"schedule.decide_at": 0.3, "schedule.learning_rate_exposure": 5e-3, "surface.initial_radius": 0.15}
+    )  # near the ball: a short fit
     found = np.array(trainer.gains()["rgb"])
     true = np.array([gains[f.view] for f in scene.frames_of("rgb", scene.split.train)])
     true /= np.exp(np.log(true).mean())
     error = np.sqrt(np.square(np.log(found / true)).mean())
     assert error < 0.4 * np.sqrt(np.square(np.log(true)).mean()), (found, true)
-    forced = _fitted(scene, steps=40, exposure="off")
-    assert forced.gains() == {} and "asked for by the recipe" in forced.needs.evidence["exposure"]
+    forced = _fitted(scene, steps=40, **{"radiance.exposure": "off"})
+    assert forced.gains() == {} and "asked for by the recipe" in forced.needs.choices["exposure"].why
 
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_the_recipe_can_force_the_degree_of_view_dependence(tmp_path: Path, degree: int) -> None:
-    trainer = _fitted(_scene(tmp_path / "s"), steps=20, view_dependence=degree)
+    trainer = _fitted(_scene(tmp_path / "s"), steps=20, **{"radiance.view_dependence": degree})
     assert trainer.field.view_dependence == {"rgb": degree}
-    assert "asked for by the recipe" in trainer.needs.evidence["view_dependence.rgb"]
+    assert "asked for by the recipe" in trainer.needs.choices["view_dependence.rgb"].why
 
 
 def _needs(scene: Scene, **recipe: object) -> Needs:
-    return assess(scene, load_measurements(scene), Recipe.model_validate({**SMALL, **recipe}), 0, 1e6)
+    return assess(scene, load_measurements(scene), Recipe().with_changes({**SMALL, **recipe}), 0, 1e6)
 
 
-def test_a_modality_with_few_frames_is_scarce() -> None:
+def test_a_modality_with_few_frames_is_sparse() -> None:
     from mmsynth.packaged import data_folder
 
     scene = load_scene(data_folder("example_scene"))
-    assert _needs(scene).scarce == ()
+    assert _needs(scene).sparse == ()
     few = _needs(keep_frames(scene, {"pol": 2}))
-    assert few.scarce == ("pol",) and 0 < few.share["pol"] < 0.5 and few.share["rgb"] == 1.0
-    assert _needs(keep_frames(scene, {"pol": 2}), scarce_below=0.0).scarce == ()
+    assert few.sparse == ("pol",) and 0 < few.share["pol"] < 0.5 and few.share["rgb"] == 1.0
+    assert _needs(keep_frames(scene, {"pol": 2}), **{"sampling.sparse_below": 0.0}).sparse == ()
 
 
-def test_a_scarce_modality_leaves_geometry_and_appearance_alone() -> None:
+def test_a_sparse_modality_leaves_geometry_and_appearance_alone() -> None:
     from mmsynth.packaged import data_folder
 
-    scene = keep_frames(load_scene(data_folder("example_scene"), ["rgb", "pol"]), {"rgb": 1})
-    trainer = Trainer(scene, Recipe.model_validate({**SMALL, "eikonal": 0.0}), 10, None, 0, "cpu")
-    assert trainer.needs.scarce == ("rgb",)
+    scene = keep_frames(load_scene(data_folder("example_scene"), modalities=["rgb", "pol"]), {"rgb": 1})
+    trainer = Trainer(scene, Recipe().with_changes({**SMALL, "loss.eikonal_weight": 0.0}), 10, None, 0, "cpu")
+    assert trainer.needs.sparse == ("rgb",)
     weights = trainer.field.shader.heads.weight
     before = weights.detach().clone()
     tables = {n: p.detach().clone() for n, p in trainer.field.named_parameters() if n.endswith(".table")}
-    # without the plentiful modality nothing may move but the scarce one's own colours
+    # without the plentiful modality nothing may move but the sparse one's own colours
     trainer.measurements.pop("pol")
     trainer.needs.share.pop("pol")
     trainer.run_step()
@@ -176,14 +178,20 @@ def test_a_cell_of_the_surface_is_seen_by_enough_measurements(tmp_path: Path) ->
     scene = _scene(tmp_path / "plain")
     measurements = load_measurements(scene)
     pixels = sum(int(m.ends[-1]) for m in measurements.values())
-    fine = {"surface_cells": 64.0}  # finer than pixels, so that only the measurements limit it
-    enough, few = (assess(scene, measurements, Recipe(measurements_per_cell=m, **fine), 0, 1e9) for m in (1e-3, 1e-2))
-    free = assess(scene, measurements, Recipe(measurements_per_cell=1e-9, **fine), 0, 1e9)
+    cells_per_pixel = 32.0  # finer than pixels, so that only the measurements limit it
+
+    def at(measurements_per_cell: float) -> Needs:
+        changes = {"surface.cells_per_pixel": cells_per_pixel, "surface.measurements_per_cell": measurements_per_cell}
+        return assess(scene, measurements, Recipe().with_changes(changes), 0, 1e9)
+
+    enough, few = (at(m) for m in (1e-3, 1e-2))
+    free = at(1e-9)
     assert 6 * few.design.surface_finest**2 * 1e-2 == pytest.approx(pixels, rel=0.02)
     assert 6 * enough.design.surface_finest**2 * 1e-3 >= pixels or enough.design.surface_finest == 1024
     # what is coarser is softer, in proportion
-    wanted = free.sharpness_end * few.design.surface_finest / (2 if free.design.background else 1) / fine["surface_cells"] * few.footprint
+    finest = 2 * cells_per_pixel * (2 if free.design.background else 1) / few.footprint
+    wanted = free.sharpness_end * few.design.surface_finest / finest
     assert few.sharpness_end == pytest.approx(wanted, rel=0.02)
-    assert "measurements of each" in few.evidence["resolution"] and "measurements of each" not in free.evidence["resolution"]
+    assert "measurements of each" in few.choices["resolution"].why and "measurements of each" not in free.choices["resolution"].why
     # small pictures show large things: down to a grid of 128 cells, not below
-    assert assess(scene, measurements, Recipe(measurements_per_cell=1e6, **fine), 0, 1e9).design.surface_finest == 128
+    assert at(1e6).design.surface_finest == 128

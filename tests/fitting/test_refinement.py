@@ -17,25 +17,26 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
-from mmsynth.operations.conversion.files import source_views
+from mmsynth.operations.views.load import views_of_frames
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Scene, keep_frames
 
 SMALL = {
-    "samples_per_step": 4096, "rays_at_start": 256, "surface_levels": 4, "surface_rows_log2": 13, "radiance_levels": 5,
-    "radiance_rows_log2": 14, "occupancy_resolution": 32, "eikonal_points": 256, "radiance_hidden": 32, "view_dependence": 1,
+    "sampling.samples_per_step": 4096, "sampling.initial_rays": 256, "surface.levels": 4, "surface.max_rows_log2": 13,
+    "radiance.levels": 5, "radiance.max_rows_log2": 14, "sampling.occupancy_resolution": 32, "loss.eikonal_points": 256,
+    "radiance.hidden_width": 32, "radiance.view_dependence": 1,
 }  # fmt: skip
 STEPS = 400
 
 
 def _recipe(**changes: object) -> Recipe:
-    return Recipe.model_validate({**SMALL, **changes})
+    return Recipe().with_changes({**SMALL, **changes})
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(data_folder("example_scene"), ["rgb", "mono", "pol"])
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "mono", "pol"])
 
 
 def _disturbed(scene: Scene, views: float, sensors: float) -> Scene:
@@ -45,8 +46,8 @@ def _disturbed(scene: Scene, views: float, sensors: float) -> Scene:
     anchors = {f.view: f.camera_to_world for f in scene.frames_of(first)}
     away = np.linalg.norm(next(iter(anchors.values()))[:3, 3] - np.array(scene.region.centre))
     unit = np.repeat([1.0, away], 3) / scene.frames_of(first)[0].camera.fx / np.sqrt(2)
-    of_views = {v: poses.rigid(views * unit * random.normal(size=(1, 6)))[0] for v in scene.split.train}
-    of_sensors = {n: poses.rigid(sensors * unit * random.normal(size=(1, 6)) * (n != first))[0] for n in scene.sensors}
+    of_views = {v: poses.motion_to_matrix(views * unit * random.normal(size=(1, 6)))[0] for v in scene.split.train}
+    of_sensors = {n: poses.motion_to_matrix(sensors * unit * random.normal(size=(1, 6)) * (n != first))[0] for n in scene.sensors}
 
     def moved(frame: Frame) -> Frame:
         anchor = anchors[frame.view]
@@ -80,8 +81,8 @@ def test_exact_poses_are_left_alone(scene: Scene) -> None:
     trainer = Trainer(scene, _recipe(), STEPS, None, 0, "cpu")
     before = {n: (m.rotations.copy(), m.origins.copy()) for n, m in trainer.measurements.items()}
     _run(trainer, 0.6)
-    assert trainer.refinement.decided == {"poses": False, "rig": False}, trainer.needs.evidence
-    assert trainer.needs.evidence["poses"].startswith("off: motions of views would save")
+    assert not trainer.refinement.decided.views.value and not trainer.refinement.decided.rig.value, trainer.needs.choices
+    assert trainer.needs.choices["poses"].why.startswith("off: motions of views would save")
     for name, m in trainer.measurements.items():
         assert np.array_equal(m.rotations, before[name][0]) and np.array_equal(m.origins, before[name][1])
     assert trainer.refinement.corrections().views == {} and trainer.refinement.sizes() == {"views": {}, "sensors": {}}
@@ -91,8 +92,9 @@ def test_exact_poses_are_left_alone(scene: Scene) -> None:
 def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, views: float, sensors: float) -> None:
     off = _disturbed(scene, views, sensors)
     field = fit(off, tmp_path, recipe=_recipe(), steps=STEPS)
-    evidence = field.manifest["needs"]["evidence"]
-    assert evidence["poses"].startswith("on" if views else "off") and evidence["rig"].startswith("on" if sensors else "off"), evidence
+    choices = field.manifest["needs"]["choices"]
+    for name, wanted in (("poses", views), ("rig", sensors)):
+        assert choices[name]["why"].startswith("on" if wanted else "off") and choices[name]["value"] is bool(wanted), choices
     assert _pixels_off(off, field, scene) < 0.5 * _pixels_off(off, None, scene)
     stored = field.manifest["poses"]
     assert set(stored["views"]) == ({str(v) for v in scene.split.train} if views else set())
@@ -101,9 +103,9 @@ def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, v
     again = Field.load(tmp_path)
     for frame in off.frames:
         assert np.array_equal(again.pose_of(frame), field.pose_of(frame))
-    for camera, pose, name in source_views(again, off, "mono"):
-        frame = next(f for f in off.frames if f.sensor == "mono" and f"{f.view:04d}" == name)
-        assert camera == frame.camera and np.array_equal(pose, field.pose_of(frame))
+    for at in views_of_frames(again, off, "mono"):
+        frame = next(f for f in off.frames if f.sensor == "mono" and f"{f.view:04d}" == at.name)
+        assert at.camera == frame.camera and np.array_equal(at.camera_to_world, field.pose_of(frame))
     if views:
         view = off.split.train[0]
         frame = next(f for f in off.frames if f.sensor == "mono" and f.view == view)
@@ -118,7 +120,7 @@ def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, v
 
 
 def test_corrections_say_in_the_scenes_frame_where_the_cameras_stand_now(scene: Scene) -> None:
-    trainer = Trainer(_disturbed(scene, 1.0, 1.0), _recipe(poses="on", rig="on"), STEPS, None, 0, "cpu")
+    trainer = Trainer(_disturbed(scene, 1.0, 1.0), _recipe(**{"poses.views": "on", "poses.rig": "on"}), STEPS, None, 0, "cpu")
     random = np.random.default_rng(0)
     refinement = trainer.refinement
     refinement.motions = poses.Motions(
@@ -135,9 +137,9 @@ def test_corrections_say_in_the_scenes_frame_where_the_cameras_stand_now(scene: 
 
 
 def test_a_look_at_rays_leaves_the_next_step_alone(scene: Scene) -> None:
-    trainer = _run(Trainer(scene, _recipe(poses="off", rig="off"), STEPS, None, 0, "cpu"), 0.05)
+    trainer = _run(Trainer(scene, _recipe(**{"poses.views": "off", "poses.rig": "off"}), STEPS, None, 0, "cpu"), 0.05)
     sampling = sampling_at(trainer.progress, trainer.recipe, trainer.needs)
-    rows = trainer._see(sampling, dict.fromkeys(trainer.measurements, 50), np.random.default_rng(0))
+    rows = trainer._look(sampling, dict.fromkeys(trainer.measurements, 50), np.random.default_rng(0))
     assert len(rows.residual) == 150 and bool(torch.isfinite(rows.by_origin).all()) and bool((rows.by_direction != 0).any())
     assert all(p.grad is None or not p.grad.any() for p in trainer.field.parameters())
     assert all(p.requires_grad for p in trainer.field.parameters())
@@ -145,7 +147,7 @@ def test_a_look_at_rays_leaves_the_next_step_alone(scene: Scene) -> None:
 
 def test_a_broken_off_refinement_goes_on_to_the_same_field(scene: Scene, tmp_path: Path) -> None:
     off = _disturbed(keep_frames(scene, {"mono": 4, "pol": 4}), 2.0, 0.0)
-    recipe = _recipe(poses="on", rig="on", poses_at=0.1)
+    recipe = _recipe(**{"poses.views": "on", "poses.rig": "on", "poses.start_at": 0.1})
     whole = _run(Trainer(off, recipe, 60, None, 0, "cpu"))
     part = _run(Trainer(off, recipe, 60, None, 0, "cpu"), 0.5)
     assert part.refinement.steps > 1 and part.refinement.motions.views.any()
@@ -157,24 +159,32 @@ def test_a_broken_off_refinement_goes_on_to_the_same_field(scene: Scene, tmp_pat
     assert np.array_equal(after.refinement.motions.sensors, whole.refinement.motions.sensors)
     for name, tensor in whole.field.state_dict().items():
         assert torch.equal(tensor, after.field.state_dict()[name]), name
-    assert after.needs.evidence == whole.needs.evidence
+    assert after.needs.choices == whole.needs.choices
 
 
 def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
-    forced = _run(Trainer(scene, _recipe(poses="on", rig="off", poses_at=0.0), 20, None, 0, "cpu"))
-    assert forced.refinement.decided == {"poses": True, "rig": False}
-    assert "asked for by the recipe" in forced.needs.evidence["poses"] and "asked for by the recipe" in forced.needs.evidence["rig"]
+    forced = _run(Trainer(scene, _recipe(**{"poses.views": "on", "poses.rig": "off", "poses.start_at": 0.0}), 20, None, 0, "cpu"))
+    assert forced.refinement.decided is not None
+    assert forced.refinement.decided.views.value and not forced.refinement.decided.rig.value
+    assert "asked for by the recipe" in forced.needs.choices["poses"].why and "asked for by the recipe" in forced.needs.choices["rig"].why
     alone = dataclasses.replace(scene, split=dataclasses.replace(scene.split, train=scene.split.train[:1]))
-    one = _run(Trainer(alone, _recipe(poses="on", poses_at=0.0), 10, None, 0, "cpu"))
-    assert one.refinement.decided is not None and not one.refinement.decided["poses"]
-    assert one.needs.evidence["poses"] == "off: there is one view"
-    single = Trainer(load_scene(data_folder("example_scene"), ["rgb"]), _recipe(rig="on", poses="off"), 10, None, 0, "cpu")
-    assert single.needs.evidence["rig"] == "off: no two sensors share views"
+    one = _run(Trainer(alone, _recipe(**{"poses.views": "on", "poses.start_at": 0.0}), 10, None, 0, "cpu"))
+    assert one.refinement.decided is not None and not one.refinement.decided.views.value
+    assert one.needs.choices["poses"].why == "off: there is one view"
+    single = Trainer(
+        load_scene(data_folder("example_scene"), modalities=["rgb"]),
+        _recipe(**{"poses.rig": "on", "poses.views": "off"}),
+        10,
+        None,
+        0,
+        "cpu",
+    )
+    assert single.needs.choices["rig"].why == "off: no two sensors share views"
 
 
-def test_the_evidence_is_in_the_manifest_and_the_checkpoint(scene: Scene, tmp_path: Path) -> None:
+def test_the_choice_is_in_the_manifest_and_the_checkpoint(scene: Scene, tmp_path: Path) -> None:
     fit(scene, tmp_path, recipe=_recipe(), steps=60)
-    evidence = json.loads((tmp_path / "manifest.json").read_text())["needs"]["evidence"]
+    choices = json.loads((tmp_path / "manifest.json").read_text())["needs"]["choices"]
     saved = read_checkpoint(tmp_path)
     assert saved is not None
-    assert saved["refinement"]["evidence"] == {k: evidence[k] for k in ("poses", "rig")}
+    assert saved["refinement"]["decided"] == {"views": choices["poses"], "rig": choices["rig"]}

@@ -15,25 +15,25 @@ from mmsynth.fitting import run as run_module
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2
+from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2, size_tables
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region, Scene, Sensor
 
 SMALL: dict[str, Any] = {
-    "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "radiance_levels": 4, "occupancy_resolution": 24,
-    "occupancy_every": 4, "eikonal_points": 64, "radiance_hidden": 32, "surface_rows_log2": 16, "radiance_rows_log2": 17,
-    "radiance_cells": 60.0, "cells_per_row": 2.0, "rays_per_row": 1e-3, "tables_at": 0.125, "levels_until": 0.5, "poses": "off",
-    "rig": "off", "average": 0.25,
-    "view_dependence": 1,
-    "exposure": "off",
+    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "surface.levels": 4, "radiance.levels": 4,
+    "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 4, "loss.eikonal_points": 64, "radiance.hidden_width": 32,
+    "surface.max_rows_log2": 16, "radiance.max_rows_log2": 17, "radiance.cells_per_pixel": 30.0, "surface.cells_per_row": 2.0,
+    "radiance.cells_per_row": 2.0, "surface.rays_per_row": 0.002, "radiance.rays_per_row": 1e-3, "schedule.tables_at": 0.125,
+    "schedule.levels_until": 0.5, "poses.views": "off", "poses.rig": "off", "schedule.ema_fraction": 0.25, "radiance.view_dependence": 1,
+    "radiance.exposure": "off",
 }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(data_folder("example_scene"), ["rgb", "nir"])
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "nir"])
 
 
 def _ball(radius: float, **sizes: Any) -> Field:
@@ -71,7 +71,9 @@ def test_rows_stay_within_what_is_sensible_and_the_recipe_allows() -> None:
 
 def test_a_short_fit_has_fewer_rows(scene: Scene) -> None:
     """50 rays for a row of the radiance, 100 for one of the surface, 1638 rays a step."""
-    recipe = Recipe.model_validate({**SMALL, "rays_per_row": 50.0, "samples_per_step": 16384})
+    recipe = Recipe().with_changes(
+        {**SMALL, "surface.rays_per_row": 100.0, "radiance.rays_per_row": 50.0, "sampling.samples_per_step": 16384}
+    )
     designs = {steps: Trainer(scene, recipe, steps, None, 0, "cpu").field.design for steps in (100, 2000, 8000)}
     assert [d.radiance_rows_log2 for d in designs.values()] == [12, 16, 17]
     assert [d.surface_rows_log2 for d in designs.values()] == [12, 15, 16]
@@ -102,15 +104,17 @@ def test_levels_in_use_keep_their_rows() -> None:
 
 
 def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
-    trainer = Trainer(scene, Recipe.model_validate(SMALL), 16, None, 0, "cpu")
+    trainer = Trainer(scene, Recipe().with_changes(SMALL), 16, None, 0, "cpu")
     assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
-    assert "tables" not in trainer.needs.evidence
+    assert "tables" not in trainer.needs.choices
     while trainer.progress < 0.125:
         trainer.run_step()
     coarse = int(trainer.field.appearance.offsets[2])
     before, moments = trainer.field.appearance.table.detach().clone(), trainer.optimiser.moments["appearance.table"][0].clone()
-    trainer._size_tables(sampling_at(trainer.progress, trainer.recipe, trainer.needs), torch.Generator().manual_seed(0))
-    design, evidence = trainer.field.design, trainer.needs.evidence["tables"]
+    sampling, generator = sampling_at(trainer.progress, trainer.recipe, trainer.needs), torch.Generator().manual_seed(0)
+    trainer.state.tables = size_tables(trainer.field, trainer.recipe, sampling, generator)
+    trainer._resize_tables(trainer.state.tables, generator)
+    design, evidence = trainer.field.design, trainer.needs.choices["tables"].why
     assert isinstance(design.radiance_rows_log2, tuple) and design.radiance_rows_log2[:2] == (17, 17)
     fine = design.radiance_rows_log2[-1]
     assert 12 <= fine < 17 and f"radiance 2^{fine} for" in evidence and "no more" not in evidence.split("radiance")[1]
@@ -127,7 +131,9 @@ def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
 def test_a_small_object_gets_smaller_tables_than_a_large_one(scene: Scene) -> None:
     rows = {}
     for radius in (0.1, 0.6):
-        recipe = Recipe.model_validate({**SMALL, "initial_radius": radius, "learning_rate_grid": 1e-9, "learning_rate_network": 1e-9})
+        recipe = Recipe().with_changes(
+            {**SMALL, "surface.initial_radius": radius, "schedule.learning_rate_grid": 1e-9, "schedule.learning_rate_network": 1e-9}
+        )
         trainer = Trainer(scene, recipe, 16, None, 0, "cpu")  # what it starts from is what it keeps
         while trainer.state.tables is None:
             trainer.run_step()
@@ -136,9 +142,9 @@ def test_a_small_object_gets_smaller_tables_than_a_large_one(scene: Scene) -> No
 
 
 def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
-    trainer = Trainer(scene, Recipe.model_validate({**SMALL, "tables_at": 0.0}), 8, None, 0, "cpu")
+    trainer = Trainer(scene, Recipe().with_changes({**SMALL, "schedule.tables_at": 0.0}), 8, None, 0, "cpu")
     assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
-    assert "asked for by the recipe" in trainer.needs.evidence["tables"]
+    assert "asked for by the recipe" in trainer.needs.choices["tables"].why
     design = trainer.field.design
     while trainer.progress < 1:
         trainer.run_step()
@@ -149,7 +155,7 @@ def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
 def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
 ) -> None:
-    recipe = Recipe.model_validate(SMALL)
+    recipe = Recipe().with_changes(SMALL)
     whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=16)
     monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
 
@@ -160,7 +166,7 @@ def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
     with pytest.raises(RuntimeError, match="killed"):
         fit(scene, tmp_path / "cut", recipe=recipe, steps=16, on_step=kill)
     resumed = fit(scene, tmp_path / "cut", recipe=recipe, resume=True)
-    assert resumed.design == whole.design and resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+    assert resumed.design == whole.design and resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
     for name, value in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], value), name
     loaded = Field.load(tmp_path / "cut")

@@ -36,21 +36,22 @@ from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera, ray_map
 
 # every number that a result here depends on: the defaults are tuned from time to time
-SMALL = Recipe.model_validate({
-    "samples_per_step": 2048, "rays_at_start": 128, "surface_levels": 4, "surface_rows_log2": 12, "radiance_levels": 4,
-    "radiance_rows_log2": 12, "surface_cells": 1.0, "radiance_cells": 2.0, "surface_hidden": 32, "radiance_hidden": 64,
-    "occupancy_resolution": 24, "occupancy_every": 16, "initial_radius": 0.3, "horizon": 1.8, "sharpness_start": 20.0,
-    "sharpness_end": 4.0, "sharpness_until": 0.6, "step_width": 2.0, "stride": 0.7, "grazing": 0.5, "significant": 0.01, "opaque": 3.0,
-    "levels_until": 0.4, "view_dependence_from": 0.3, "decide_at": 0.6, "view_dependence": 2, "exposure": "off",
-    "measurements_per_cell": 1e-3, "learning_rate_sharpness": 200.0,
-    "learning_rate_grid": 2e-2, "learning_rate_network": 8e-3, "learning_rate_end": 0.1, "average": 0.05,
-    "eikonal": 0.05, "eikonal_points": 128,
-    "emptiness": 0.02, "opacity": 0.5,
+SMALL = Recipe().with_changes({
+    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "surface.levels": 4, "surface.max_rows_log2": 12,
+    "radiance.levels": 4, "radiance.max_rows_log2": 12, "surface.cells_per_pixel": 0.5, "radiance.cells_per_pixel": 1.0,
+    "surface.hidden_width": 32, "radiance.hidden_width": 64, "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 16,
+    "surface.initial_radius": 0.3, "surface.outer_radius": 1.8, "schedule.sharpness_start": 20.0, "schedule.sharpness_per_footprint": 4.0,
+    "schedule.sharpness_until": 0.6, "sampling.step_width": 2.0, "sampling.sphere_step_factor": 0.7, "sampling.min_slope": 0.5,
+    "sampling.min_section_weight": 0.01, "sampling.max_optical_depth": 3.0, "schedule.levels_until": 0.4,
+    "schedule.view_dependence_from": 0.3, "schedule.decide_at": 0.6, "radiance.view_dependence": 2, "radiance.exposure": "off",
+    "surface.measurements_per_cell": 1e-3, "schedule.full_rate_sharpness": 200.0, "schedule.learning_rate_grid": 2e-2,
+    "schedule.learning_rate_network": 8e-3, "schedule.learning_rate_end_factor": 0.1, "schedule.ema_fraction": 0.05,
+    "loss.eikonal_weight": 0.05, "loss.eikonal_points": 128, "loss.background_opacity_weight": 0.02, "loss.alpha_weight": 0.5,
 })  # fmt: skip
 
 
 def _recipe(**changes: Any) -> Recipe:
-    return Recipe.model_validate({**SMALL.model_dump(), **changes})
+    return SMALL.with_changes(changes)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +122,7 @@ def test_a_fit_with_a_background_learns_too(tmp_path: Path) -> None:
         return np.where(hit[..., None], 0.7, 0.5 + 0.4 * d)
 
     scene = _ball_scene(tmp_path, picture, 24)
-    field = fit(scene, tmp_path / "run", recipe=_recipe(background="on"), steps=600)
+    field = fit(scene, tmp_path / "run", recipe=_recipe(**{"surface.background": "on"}), steps=600)
     assert field.design.background and field.surface.grid.extent == 2.0
     (frame,) = scene.frames_of("rgb", scene.split.test)
     seen = field.render(frame.camera, frame.camera_to_world)
@@ -142,7 +143,9 @@ class Killed(Exception):
 
 @pytest.mark.parametrize("decide_at", [0.2, 0.8])  # before and after the kill
 def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decide_at: float) -> None:
-    recipe = _recipe(decide_at=decide_at, view_dependence="auto", exposure="on", occupancy_every=5)
+    recipe = _recipe(
+        **{"schedule.decide_at": decide_at, "radiance.view_dependence": "auto", "radiance.exposure": "on", "sampling.occupancy_every": 5}
+    )
     whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=24, seed=3)
     monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
 
@@ -162,12 +165,12 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, mo
     assert resumed.view_dependence == whole.view_dependence
     same = ("exposure", "recipe", "seed", "steps", "train_psnr", "skipped_steps", "grid_reopened")
     assert {k: resumed.manifest[k] for k in same} == {k: whole.manifest[k] for k in same}
-    assert resumed.manifest["needs"]["evidence"] == whole.manifest["needs"]["evidence"]
+    assert resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
 
 
 @pytest.mark.parametrize("average", [0.0, 0.2])
 def test_the_field_is_the_mean_over_the_last_steps(scene: Scene, tmp_path: Path, average: float) -> None:
-    field = fit(scene, tmp_path, recipe=_recipe(average=average), steps=30)
+    field = fit(scene, tmp_path, recipe=_recipe(**{"schedule.ema_fraction": average}), steps=30)
     saved = read_checkpoint(tmp_path)
     assert saved is not None
     expected = {n.removeprefix("field."): m for n, m in saved["average"]["means"].items()} if average else saved["field"]
@@ -228,9 +231,9 @@ def test_a_checkpoint_of_another_fit_is_refused(scene: Scene, tmp_path: Path) ->
     with pytest.raises(InputError, match="steps"):
         fit(scene, tmp_path, recipe=SMALL, steps=5, resume=True)
     with pytest.raises(InputError, match="recipe"):
-        fit(scene, tmp_path, recipe=_recipe(eikonal=0.2), steps=3, resume=True)
+        fit(scene, tmp_path, recipe=_recipe(**{"loss.eikonal_weight": 0.2}), steps=3, resume=True)
     with pytest.raises(InputError, match="scene"):
-        fit(load_scene(data_folder("example_scene"), ["rgb"]), tmp_path, recipe=SMALL, steps=3, resume=True)
+        fit(load_scene(data_folder("example_scene"), modalities=["rgb"]), tmp_path, recipe=SMALL, steps=3, resume=True)
     (tmp_path / "checkpoint" / "state.pt").write_bytes(b"broken")
     with pytest.raises(InputError, match="not a readable checkpoint"):
         fit(scene, tmp_path, recipe=SMALL, steps=3, resume=True)
@@ -279,7 +282,7 @@ def test_length_is_steps_or_time(scene: Scene) -> None:
 
 
 def test_the_number_of_rays_follows_the_samples(scene: Scene) -> None:
-    trainer = _trainer(scene, 40, occupancy_every=4)
+    trainer = _trainer(scene, 40, **{"sampling.occupancy_every": 4})
     counts, samples = [trainer.state.rays], []
     for _ in range(40):
         before = trainer.state.samples_total
@@ -393,7 +396,9 @@ def test_black_pixels_of_a_black_scene_ask_for_emptiness(tmp_path: Path) -> None
     opacity = _opacity(trainer, batch)
     black = batch.target.reshape(400, 3).amax(1) == 0
     assert 50 < black.sum() < 350 and (opacity[black] > 0.5).sum() > 50
-    more = _loss(trainer, batch, emptiness=0.5, eikonal=0.0) - _loss(trainer, batch, emptiness=0.0, eikonal=0.0)
+    more = _loss(trainer, batch, **{"loss.background_opacity_weight": 0.5, "loss.eikonal_weight": 0.0}) - _loss(
+        trainer, batch, **{"loss.background_opacity_weight": 0.0, "loss.eikonal_weight": 0.0}
+    )
     assert more == pytest.approx(0.5 * float((opacity * black).mean()), rel=1e-4)
 
 
@@ -403,9 +408,13 @@ def test_alpha_asks_for_opacity(tmp_path: Path) -> None:
     batch = _batch(trainer, 400)
     assert set(batch.alpha.tolist()) == {0.0, 1.0}
     opacity = _opacity(trainer, batch)
-    more = _loss(trainer, batch, opacity=0.7, eikonal=0.0) - _loss(trainer, batch, opacity=0.0, eikonal=0.0)
+    more = _loss(trainer, batch, **{"loss.alpha_weight": 0.7, "loss.eikonal_weight": 0.0}) - _loss(
+        trainer, batch, **{"loss.alpha_weight": 0.0, "loss.eikonal_weight": 0.0}
+    )
     assert more == pytest.approx(0.7 * float((opacity - batch.alpha).square().mean()), rel=1e-4)
-    assert _loss(trainer, batch, opacity=0.0, emptiness=9.0, eikonal=0.0) == _loss(trainer, batch, opacity=0.0, eikonal=0.0)
+    assert _loss(trainer, batch, **{"loss.alpha_weight": 0.0, "loss.background_opacity_weight": 9.0, "loss.eikonal_weight": 0.0}) == _loss(
+        trainer, batch, **{"loss.alpha_weight": 0.0, "loss.eikonal_weight": 0.0}
+    )
 
 
 def test_an_object_on_black_is_found(tmp_path: Path) -> None:
@@ -440,7 +449,7 @@ def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Calla
 
 @pytest.mark.parametrize("background", ["off", "on"])
 def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, monkeypatch: pytest.MonkeyPatch, background: str) -> None:
-    trainer = _trainer(scene, background=background)
+    trainer = _trainer(scene, **{"surface.background": background})
     asked: list[torch.Tensor] = []
     gradient = Surface.gradient
 
@@ -465,12 +474,12 @@ def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, monkeypa
 
 def test_only_needed_parts_are_built(scene: Scene) -> None:
     trainer = _trainer(scene)
-    assert not trainer.field.design.background and trainer.needs.evidence["background"].startswith("off")
-    forced = _trainer(scene, background="on")
-    assert forced.field.design.background and "asked for by the recipe" in forced.needs.evidence["background"]
+    assert not trainer.field.design.background and trainer.needs.choices["background"].why.startswith("off")
+    forced = _trainer(scene, **{"surface.background": "on"})
+    assert forced.field.design.background and "asked for by the recipe" in forced.needs.choices["background"].why
     assert forced.field.surface.grid.extent == forced.field.appearance.extent == forced.field.occupancy.extent == 2.0
-    rgb = load_scene(data_folder("example_scene"), ["rgb"])
-    assert _trainer(rgb).needs.evidence["tensor_head"].startswith("off")
+    rgb = load_scene(data_folder("example_scene"), modalities=["rgb"])
+    assert _trainer(rgb).needs.choices["tensor_head"].why.startswith("off")
 
 
 def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene) -> None:
@@ -483,7 +492,7 @@ def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene
 
 
 def test_a_grid_in_which_nothing_is_left_opens_again_and_it_is_counted(scene: Scene) -> None:
-    trainer = _trainer(scene, occupancy_every=1)
+    trainer = _trainer(scene, **{"sampling.occupancy_every": 1})
     trainer.run_step()
     assert trainer.state.reopened == 0
     with torch.no_grad():
@@ -528,7 +537,8 @@ def test_a_fit_goes_from_coarse_to_fine(scene: Scene) -> None:
     np.testing.assert_allclose([s.step for s in at], np.minimum(0.1, 2.0 / sharpness))
     assert at[0].active_surface == at[0].active_radiance == 2 and {s.active_surface for s in at} == {2, 3, 4}
     assert all(s.active_surface == s.active_radiance == 4 for s in at[40:])
-    assert (at[50].stride, at[50].grazing, at[50].significant, at[50].opaque) == (0.7, 0.5, 0.01, 3.0)
+    factors = at[50].sphere_step_factor, at[50].min_slope, at[50].min_section_weight, at[50].max_optical_depth
+    assert factors == (0.7, 0.5, 0.01, 3.0)
 
 
 def test_the_learning_rate_rises_and_falls() -> None:
@@ -546,7 +556,15 @@ def test_recipes() -> None:
 
 def test_bad_recipe_files(tmp_path: Path) -> None:
     path = tmp_path / "r.toml"
-    cases = [("speed = 3", "speed"), ("eikonal = -1", "eikonal"), ("eikonal = ", "not valid TOML"), ("surface_hidden = 6", "multiple of 4")]
+    cases = [
+        ("speed = 3", "speed"),
+        ("loss.eikonal_weight = -1", "eikonal_weight"),
+        ("loss.eikonal_weight = ", "not valid TOML"),
+        ("surface.hidden_width = 6", "multiple of 4"),
+        ("[loss]\nspeed = 3", "loss.speed"),
+        ("surface_levels = 4", r"surface_levels: is no section of a recipe, expected keys in the sections \[surface\]"),
+        ("poses = 'on'", "sections"),
+    ]
     for text, message in cases:
         path.write_text(text)
         with pytest.raises(InputError, match=message):

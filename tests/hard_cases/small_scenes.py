@@ -13,9 +13,10 @@ import numpy as np
 from mmsynth.fitting.recipe import Recipe
 
 WIDTH, HEIGHT, FOCAL, RADIUS = 32, 24, 40.0, 0.7
-QUICK = Recipe.model_validate({
-    "samples_per_step": 1024, "rays_at_start": 128, "surface_levels": 3, "surface_rows_log2": 12, "radiance_levels": 3,
-    "radiance_rows_log2": 12, "occupancy_resolution": 16, "occupancy_every": 8, "eikonal_points": 64, "radiance_hidden": 16,
+QUICK = Recipe().with_changes({
+    "sampling.samples_per_step": 1024, "sampling.initial_rays": 128, "surface.levels": 3, "surface.max_rows_log2": 12,
+    "radiance.levels": 3, "radiance.max_rows_log2": 12, "sampling.occupancy_resolution": 16, "sampling.occupancy_every": 8,
+    "loss.eikonal_points": 64, "radiance.hidden_width": 16,
 })  # fmt: skip
 
 

@@ -176,7 +176,7 @@ def test_a_modality_that_is_clipped_throughout(row: Row, tmp_path: Path) -> None
     """It only says "at least": nothing to choose directions by, nothing to divide by."""
     field = _fit(tmp_path, {"mono": around(6), "rgb": around(6)}, alter={"rgb": np.ones_like})
     assert field.view_dependence["rgb"] == 0
-    assert "nothing that could be told apart" in field.manifest["needs"]["evidence"]["view_dependence.rgb"]
+    assert "nothing that could be told apart" in field.manifest["needs"]["choices"]["view_dependence.rgb"]["why"]
     measured = torch.ones(HEIGHT, WIDTH, 3)
     usual = float((measured[measured < 1.0] - 0.5).square().mean())
     assert math.isnan(usual)
@@ -193,11 +193,11 @@ def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
     wrong = {"mono": lambda _: picture(poses["mono"][0], 0.5).mean(-1)}
     psnr: dict[str, list[float]] = {"joint": [], "ours": []}
     for seed in range(3):
-        for name, below in (("joint", 0.0), ("ours", QUICK.scarce_below)):
+        for name, below in (("joint", 0.0), ("ours", QUICK.sparse_below)):
             folder = write_scene(tmp_path / "scene", poses, alter=wrong)
-            recipe = Recipe.model_validate({**QUICK.model_dump(), "scarce_below": below})
+            recipe = QUICK.with_changes({"sampling.sparse_below": below})
             field = fit(load_scene(folder), tmp_path / "run", recipe=recipe, steps=200, seed=seed)
-            assert field.manifest["needs"]["scarce"] == (("mono",) if name == "ours" else ())
+            assert field.manifest["needs"]["sparse"] == (("mono",) if name == "ours" else ())
             psnr[name].append(evaluate(field, load_scene(folder))["modalities"]["rgb"]["psnr"])
     gains = np.subtract(psnr["ours"], psnr["joint"])
     assert gains.min() > 0 and gains.mean() > 1
@@ -271,7 +271,7 @@ def test_cameras_inside_the_region(row: Row, tmp_path: Path) -> None:
         pose[:3, :3] = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
         pose[:3, 3] *= 0.05
         outwards.append(pose)
-    recipe = Recipe.model_validate({**QUICK.model_dump(), "background": "on"})
+    recipe = QUICK.with_changes({"surface.background": "on"})
     paint = lambda image: 0.3 + 0.2 * np.random.default_rng(0).random(image.shape)
     field = _fit(tmp_path, {"rgb": outwards}, recipe=recipe, alter={"rgb": paint})
     # NeuS, near_far_from_sphere: one radius before and one behind the point nearest to the centre
@@ -346,21 +346,21 @@ def test_rotations_by_nothing_and_by_half_a_turn(row: Row) -> None:
     for angle in (0.0, 1e-12, 1e-8, 1e-4, 1.0, math.pi - 1e-7, math.pi):
         axis = generator.normal(size=3)
         motion = np.concatenate([angle * axis / np.linalg.norm(axis), generator.normal(size=3)])
-        matrix = motions.rigid(motion[None])[0]
+        matrix = motions.motion_to_matrix(motion[None])[0]
         assert np.isfinite(matrix).all() and np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < 1e-12
-        again = motions.rigid(motions.motion_of(matrix[None]))[0]
+        again = motions.motion_to_matrix(motions.matrix_to_motion(matrix[None]))[0]
         worst = max(worst, float(np.abs(again - matrix).max()))
     assert worst < 1e-6
     with np.errstate(invalid="ignore"):
         assert np.isnan(_rodrigues(np.zeros(3))).all() and np.isnan(_log(np.eye(3))).all()
-    some = motions.rigid(np.array([[0.3, -0.4, 0.1, 0.0, 0.0, 0.0]]))[0, :3, :3]
+    some = motions.motion_to_matrix(np.array([[0.3, -0.4, 0.1, 0.0, 0.0, 0.0]]))[0, :3, :3]
     np.testing.assert_allclose(_rodrigues(_log(some)), some, atol=1e-12)
     axes = generator.normal(size=(100, 3))
     turns = np.concatenate([math.pi * axes / np.linalg.norm(axes, axis=1, keepdims=True), np.zeros((100, 3))], 1)
-    half = motions.rigid(turns)
+    half = motions.motion_to_matrix(turns)
     with np.errstate(divide="ignore", invalid="ignore"):
         lost = sum(not np.abs(_rodrigues(_log(m[:3, :3])) - m[:3, :3]).max() < 0.1 for m in half)
-    assert lost > 30 and np.abs(motions.rigid(motions.motion_of(half)) - half).max() < 1e-6
+    assert lost > 30 and np.abs(motions.motion_to_matrix(motions.matrix_to_motion(half)) - half).max() < 1e-6
     row(
         "rotations by 0 and by π",
         f"exp by ω / norm(ω): NaN at 0; log by θ / (2 sin θ) (R - Rᵀ): NaN at 0, another axis or NaN for {lost} of 100 at π",

@@ -18,17 +18,21 @@ def _moved(sharpness: float, slower: bool = True) -> float:
     """How far noise, which asks for nothing, makes the surface tremble late in a fit, in widths of the soft surface."""
     torch.manual_seed(0)
     recipe = Recipe()
+    rates = recipe.schedule
     surface = Surface(HashGrid(4, 12, 8, 64), 16, (0.5, 4.0))
     torch.nn.init.normal_(surface.output_weight, std=0.3)
     parameters = dict(surface.named_parameters())
-    optimiser = Adam(parameters, {n: recipe.learning_rate_grid if n == "grid.table" else recipe.learning_rate_network for n in parameters})
+    optimiser = Adam(
+        parameters,
+        {n: rates.learning_rate_grid if n == "grid.table" else rates.learning_rate_network for n in parameters},
+    )
     factors = dict.fromkeys(parameters, surface_rate_factor(sharpness, recipe) if slower else 1.0)
     points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=-1) * 0.5
     trembling = []
     for _ in range(20):
         before = surface(points, 4).detach()
         (surface(points, 4) * torch.randn(len(points))).sum().backward()
-        optimiser.step(recipe.learning_rate_end, factors)
+        optimiser.step(rates.learning_rate_end_factor, factors)
         trembling.append(float((surface(points, 4).detach() - before).square().mean().sqrt()))
     return sum(trembling) / len(trembling) * sharpness / 3.5
 

@@ -34,7 +34,7 @@ def scene(tmp_path: Path) -> Scene:
 
 
 def _trainer(scene: Scene, steps: int = 40, **changes: object) -> Trainer:
-    return Trainer(scene, Recipe.model_validate({**QUICK.model_dump(), **changes}), steps, None, 0, "cpu")
+    return Trainer(scene, QUICK.with_changes(changes), steps, None, 0, "cpu")
 
 
 def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
@@ -127,7 +127,7 @@ def _resumed_from_parameters(scene: Scene, recipe: Recipe, at: int) -> float:
 
 def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed where levels open, tables are sized, directions are decided."""
-    recipe = Recipe.model_validate({**QUICK.model_dump(), "poses": "on"})
+    recipe = QUICK.with_changes({"poses.views": "on"})
     whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=40)
     monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
     for at in (1, 3, 13, 25, 39):
@@ -140,7 +140,7 @@ def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_
             fit(scene, tmp_path / f"cut{at}", recipe=recipe, steps=40, on_step=kill)
         resumed = fit(scene, tmp_path / f"cut{at}", recipe=recipe, resume=True)
         assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True)), at
-    off = _resumed_from_parameters(scene, Recipe.model_validate({**QUICK.model_dump(), "tables_at": 0}), 25)
+    off = _resumed_from_parameters(scene, QUICK.with_changes({"schedule.tables_at": 0}), 25)
     assert off > 0.005
     row(
         "killed after 1, 3, 13, 25, 39 of 40 steps and resumed",
@@ -204,7 +204,7 @@ def _nerfacc_fit(opacity: float, steps: int) -> int:
 
 @pytest.mark.parametrize("state", [OUTSIDE, 200])
 def test_a_grid_that_was_emptied_finds_the_scene_again(row: Row, scene: Scene, state: int) -> None:
-    trainer = _trainer(scene, 60, occupancy_every=2)
+    trainer = _trainer(scene, 60, **{"sampling.occupancy_every": 2})
     trainer.run_step()
     trainer.field.occupancy.states.fill_(state)
     while trainer.progress < 1:

@@ -13,7 +13,7 @@ from analytic import AnalyticField, scene_of, sphere
 
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 
@@ -21,7 +21,11 @@ from mmsynth.sensors.camera import Camera
 def test_report(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene")
-    field.manifest = {"needs": {"evidence": {"background": "off: <nothing> there"}, "footprint": 0.01}, "seed": 7, "seconds": {"fit": 60.5}}
+    field.manifest = {
+        "needs": {"choices": {"background": {"value": False, "why": "off: <nothing> there", "changed": False}}, "footprint": 0.01},
+        "seed": 7,
+        "seconds": {"fit": 60.5},
+    }
     log = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
     evaluation = evaluate(field, scene)  # type: ignore[arg-type]
     page = write_run_report(tmp_path, field, evaluation, log, scene).read_text()  # type: ignore[arg-type]
@@ -64,3 +68,14 @@ def test_previews_of_a_mosaic_show_every_channel_in_its_place(tmp_path: Path, pa
         codes = {(1, 2): cv2.COLOR_BayerGR2RGB_EA, (2, 1): cv2.COLOR_BayerRG2RGB_EA}
         theirs = cv2.demosaicing(np.round(raw * 65535).astype(np.uint16), codes[tuple(pattern[0])]) / 65535
         np.testing.assert_allclose(shown, theirs, atol=1e-5)
+
+
+def test_previews_of_frames_with_alpha_show_what_is_scored(tmp_path: Path) -> None:
+    """Colours behind transparent pixels are of nothing that was seen."""
+    rgba = np.random.default_rng(0).random((20, 30, 4)).astype(np.float32)
+    rgba[:10, :, 3] = 0.0
+    cv2.imwrite(str(tmp_path / "0.png"), np.round(65535 * rgba[..., [2, 1, 0, 3]]).astype(np.uint16))
+    frame = Frame("rgb", 0, tmp_path / "0.png", Camera(30, 20, 20.0, 20.0, 15.0, 10.0), np.eye(4))
+    shown = measured_channels(Sensor("rgb", ("R", "G", "B"), (None, None, None)), frame)
+    np.testing.assert_allclose(shown, rgba[..., :3] * rgba[..., 3:], atol=2e-5)
+    assert not shown[:10].any()

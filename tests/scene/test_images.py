@@ -11,17 +11,8 @@ import pytest
 import tifffile
 
 from mmsynth.errors import InputError
-from mmsynth.scene.images import (
-    check_file,
-    load_frame,
-    read_image,
-    saturation_level,
-    used_bits,
-    write_exr,
-    write_npz,
-    write_png16,
-    write_tiff16,
-)
+from mmsynth.scene.image_writers import write_exr, write_npz, write_png16, write_tiff16
+from mmsynth.scene.images import check_file, load_frame, read_image, saturation_level, used_bits
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 

@@ -13,7 +13,7 @@ import pytest
 from conftest import OPENCV_TO_OPENGL, look_at
 
 from mmsynth.errors import InputError
-from mmsynth.scene.info import describe, render_text
+from mmsynth.scene.info import describe_scene, render_text
 from mmsynth.scene.load import load_scene
 
 Writer = Callable[..., Path]
@@ -44,9 +44,9 @@ def test_missing_and_unknown_folders(tmp_path: Path) -> None:
 
 def test_modalities_by_name_or_alias(write_mmsdata: Writer) -> None:
     root = write_mmsdata()
-    assert list(load_scene(root, ["infrared"]).sensors) == list(load_scene(root, ["NIR"]).sensors) == ["nir"]
+    assert list(load_scene(root, modalities=["infrared"]).sensors) == list(load_scene(root, modalities=["NIR"]).sensors) == ["nir"]
     with pytest.raises(InputError, match="no modality 'thermal' in this scene, expected one of rgb, nir"):
-        load_scene(root, ["rgb", "thermal"])
+        load_scene(root, modalities=["rgb", "thermal"])
 
 
 def test_broken_json_is_located(write_mmsdata: Writer) -> None:
@@ -89,7 +89,7 @@ def test_too_few_training_frames(write_transforms: Writer) -> None:
 def test_describe_is_json_and_text(write_mmsdata: Writer) -> None:
     root = write_mmsdata(views=range(10))
     (root / "modalities" / "rgb" / "0001.png").unlink()
-    description = describe(load_scene(root))
+    description = describe_scene(load_scene(root))
     assert json.loads(json.dumps(description, allow_nan=False)) == description
     rgb = description["sensors"]["rgb"]
     assert (rgb["frames"], rgb["train"], rgb["test"], rgb["size"], rgb["bits"]) == (9, 8, 1, [24, 18], 16)
@@ -102,7 +102,7 @@ def test_describe_lists_damaged_files_once(write_mmsdata: Writer) -> None:
     root = write_mmsdata(views=range(6))
     path = root / "modalities" / "infrared" / "0003.png"
     path.write_bytes(path.read_bytes()[:-20])
-    problems = describe(load_scene(root))["problems"]
+    problems = describe_scene(load_scene(root))["problems"]
     assert len(problems) == 1 and "0003.png: truncated PNG" in problems[0]
 
 
@@ -110,7 +110,7 @@ def test_describe_counts_pixels_without_a_ray(write_mmsdata: Writer) -> None:
     def fold(meta: dict[str, Any]) -> None:
         meta["modalities"]["rgb"]["distortion_params"] = [-1.5, 0, 0, 0, 0, 0]
 
-    description = describe(load_scene(write_mmsdata(edit=fold)))
+    description = describe_scene(load_scene(write_mmsdata(edit=fold)))
     rgb = description["sensors"]["rgb"]
     assert 0 < rgb["invalid_lens_pixels"] < 24 * 18 and rgb["round_trip_px"] < 1e-3 and rgb["lens"] == "brown_conrady"
     (problem,) = description["problems"]
@@ -130,4 +130,4 @@ def test_describe_suspects_right_aligned_data(write_mmsdata: Writer) -> None:
     for view in range(4):
         codes = np.random.default_rng(view).integers(0, 4096, (18, 24), np.uint16)
         cv2.imwrite(str(root / "modalities" / "infrared" / f"{view:04d}.png"), codes)
-    assert any("not left-aligned" in problem for problem in describe(load_scene(root))["problems"])
+    assert any("not left-aligned" in problem for problem in describe_scene(load_scene(root))["problems"])

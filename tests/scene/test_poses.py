@@ -1,4 +1,4 @@
-"""Poses files, rigidity, and the region guessed from cameras."""
+"""Poses files, and rigidity."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import OPENCV_TO_OPENGL, look_at, ring
+from conftest import OPENCV_TO_OPENGL, ring
 from scipy.spatial.transform import Rotation
 
 from mmsynth.errors import InputError
-from mmsynth.scene.load import load_scene
-from mmsynth.scene.poses import read_poses, region_from_cameras, region_from_points, rigid
+from mmsynth.scene.checks import rigid_pose
+from mmsynth.scene.load import load_scene, read_poses
 from mmsynth.sensors.camera import Camera, project
 
 CAMERA = Camera(24, 18, 25.0, 25.0, 11.5, 8.5)
@@ -48,13 +48,13 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 def test_colmap(tmp_path: Path, points: str) -> None:
     poses = ring(3)
     path = write_colmap(tmp_path, poses, points)
-    assert [camera for camera, _, _ in read_poses(path)] == [None] * 3
+    assert [stated.camera for stated in read_poses(path)] == [None] * 3
     (tmp_path / "cameras.txt").write_text("# cameras\n7 FULL_OPENCV 24 18 25 26 12 9 .1 .2 .3 .4 .5 .6 .7 .8\n")
     found = read_poses(tmp_path)
-    assert [name for _, _, name in found] == ["0000", "0001", "0002"]
-    for (camera, pose, _), expected in zip(found, poses, strict=True):
-        assert camera == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
-        np.testing.assert_allclose(pose, expected, atol=1e-12)
+    assert [stated.name for stated in found] == ["0000", "0001", "0002"]
+    for stated, expected in zip(found, poses, strict=True):
+        assert stated.camera == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
+        np.testing.assert_allclose(stated.camera_to_world, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +75,9 @@ def test_colmap_errors_name_the_line(tmp_path: Path, line: str, message: str) ->
 def test_colmap_fisheye(tmp_path: Path) -> None:
     write_colmap(tmp_path, ring(2))
     (tmp_path / "cameras.txt").write_text("7 OPENCV_FISHEYE 24 18 25 26 12 9 0.1 0.2 0 -0.01\n")
-    assert read_poses(tmp_path)[0][0] == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (0.1, 0.2, 0.0, -0.01), "kannala_brandt")
+    assert read_poses(tmp_path)[0].camera == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (0.1, 0.2, 0.0, -0.01), "kannala_brandt")
     (tmp_path / "cameras.txt").write_text("7 OPENCV_FISHEYE 24 18 25 26 12 9 0 0 0 0\n")
-    assert read_poses(tmp_path)[0][0] == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (), "kannala_brandt")
+    assert read_poses(tmp_path)[0].camera == Camera(24, 18, 25.0, 26.0, 11.5, 8.5, (), "kannala_brandt")
 
 
 def test_another_colmap_camera_is_refused(tmp_path: Path) -> None:
@@ -98,16 +98,16 @@ def test_tum(tmp_path: Path, name: str) -> None:
     lines = ["# ground truth", "# timestamp tx ty tz qx qy qz qw", *(tum_line(p, f"1305031102.{i}75") for i, p in enumerate(poses)), ""]
     (tmp_path / name).write_text("\n".join(lines))
     found = read_poses(tmp_path / name)
-    assert [n for _, _, n in found] == ["1305031102.075", "1305031102.175", "1305031102.275"]
-    for (camera, pose, _), expected in zip(found, poses, strict=True):
-        assert camera is None
-        np.testing.assert_allclose(pose, expected, atol=1e-12)
+    assert [stated.name for stated in found] == ["1305031102.075", "1305031102.175", "1305031102.275"]
+    for stated, expected in zip(found, poses, strict=True):
+        assert stated.camera is None
+        np.testing.assert_allclose(stated.camera_to_world, expected, atol=1e-12)
 
 
 def test_colmap_under_another_name_is_not_tum(tmp_path: Path) -> None:
     path = write_colmap(tmp_path, ring(2)).rename(tmp_path / "poses.txt")
-    for (_, pose, _), expected in zip(read_poses(path), ring(2), strict=True):
-        np.testing.assert_allclose(pose, expected, atol=1e-12)
+    for stated, expected in zip(read_poses(path), ring(2), strict=True):
+        np.testing.assert_allclose(stated.camera_to_world, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -135,16 +135,16 @@ def test_mmsdata_poses_are_those_of_the_scene(write_mmsdata: Callable[..., Path]
     root = write_mmsdata((0, 2, 7))
     scene = load_scene(root)
     found = read_poses(root / "meta_data.json")
-    assert [name for _, _, name in found] == ["0000", "0002", "0007"]
-    for (camera, pose, _), frame in zip(found, scene.frames_of("rgb"), strict=True):
-        assert camera == frame.camera
-        np.testing.assert_allclose(pose, frame.camera_to_world, atol=1e-15)
+    assert [stated.name for stated in found] == ["0000", "0002", "0007"]
+    for stated, frame in zip(found, scene.frames_of("rgb"), strict=True):
+        assert stated.camera == frame.camera
+        np.testing.assert_allclose(stated.camera_to_world, frame.camera_to_world, atol=1e-15)
 
 
 def test_mmsdata_poses_need_no_images(write_mmsdata: Callable[..., Path]) -> None:
     root = write_mmsdata(range(3), lambda meta: meta["modalities"]["rgb"]["frames"].reverse())
     shutil.rmtree(root / "modalities")
-    poses = [pose for _, pose, _ in read_poses(root / "meta_data.json")]
+    poses = [stated.camera_to_world for stated in read_poses(root / "meta_data.json")]
     # by frame id, turned by a quarter about z, scaled and moved to metres, as worldtogt says
     to_metres = np.array([[0.0, -0.25, 0.0, 0.1], [0.25, 0.0, 0.0, 0.2], [0.0, 0.0, 0.25, 0.3]])
     np.testing.assert_allclose([p[:3, 3] for p in poses], [to_metres @ p[:, 3] for p in ring(3)], atol=1e-12)
@@ -175,10 +175,11 @@ def write_json(tmp_path: Path, content: Any) -> Path:
 def test_transforms_as_poses(tmp_path: Path) -> None:
     frames = [{"file_path": f"out/{i}.png", "transform_matrix": (pose @ OPENCV_TO_OPENGL).tolist()} for i, pose in enumerate(ring(3))]
     for found, expected in zip(read_poses(write_json(tmp_path, {"frames": frames})), ring(3), strict=True):
-        assert found[0] is None
-        np.testing.assert_allclose(found[1], expected, atol=1e-12)
+        assert found.camera is None
+        np.testing.assert_allclose(found.camera_to_world, expected, atol=1e-12)
     shared = {"fl_x": 25.0, "w": 24, "h": 18, "frames": frames}
-    assert read_poses(write_json(tmp_path, shared))[2][0::2] == (CAMERA, "2")
+    last = read_poses(write_json(tmp_path, shared))[2]
+    assert (last.camera, last.name) == (CAMERA, "2")
 
 
 def test_camera_path(tmp_path: Path) -> None:
@@ -186,12 +187,13 @@ def test_camera_path(tmp_path: Path) -> None:
     fov = np.degrees(2 * np.arctan(18 / 2 / 25.0))
     path = [{"camera_to_world": (pose @ OPENCV_TO_OPENGL).ravel().tolist(), "fov": fov, "aspect": 4 / 3} for pose in ring(2)]
     content = {"camera_type": "perspective", "render_width": 24, "render_height": 18, "camera_path": path}
-    camera, pose, _ = read_poses(write_json(tmp_path, content))[1]
+    stated = read_poses(write_json(tmp_path, content))[1]
+    camera, pose = stated.camera, stated.camera_to_world
     assert camera is not None and camera.fx == camera.fy == pytest.approx(25.0) and (camera.cx, camera.cy) == (11.5, 8.5)
     np.testing.assert_allclose(pose, ring(2)[1], atol=1e-12)
     # the upper edge of the frame is half a field of view above the axis, wide frames or not
     for width in (24, 60):
-        camera = read_poses(write_json(tmp_path, content | {"render_width": width}))[0][0]
+        camera = read_poses(write_json(tmp_path, content | {"render_width": width}))[0].camera
         assert camera is not None
         up = np.radians(fov / 2)
         across = np.tan(up) * width / 18
@@ -205,7 +207,7 @@ def test_camera_path(tmp_path: Path) -> None:
 
 def test_rig(tmp_path: Path) -> None:
     content = {"convention": "OpenCV camera (x right, y down, z forward)", "rig": [pose.tolist() for pose in ring(2)]}
-    np.testing.assert_allclose(read_poses(write_json(tmp_path, content))[1][1], ring(2)[1], atol=1e-12)
+    np.testing.assert_allclose(read_poses(write_json(tmp_path, content))[1].camera_to_world, ring(2)[1], atol=1e-12)
     content["rig"][1][0][3] = float("nan")
     with pytest.raises(InputError, match=r"poses\.json: pose 1: .*not finite in row 0, column 3"):
         read_poses(write_json(tmp_path, content))
@@ -223,66 +225,4 @@ def test_other_content_is_refused(tmp_path: Path, content: Any) -> None:
 @pytest.mark.parametrize("bad", [None, "x", [[1, 2], [3]], np.eye(3), np.diag([1, 1, 1, 2.0]), [[None] * 4] * 3])
 def test_rigid_refuses(bad: Any) -> None:
     with pytest.raises(InputError, match=r"^here: "):
-        rigid(bad, "here")
-
-
-def test_region_of_a_ring_is_where_the_cameras_look() -> None:
-    shift = np.array([1e5, -2e5, 30.0])  # survey coordinates
-    poses = [pose.copy() for pose in ring(12)]
-    for pose in poses:
-        pose[:3, 3] += shift
-    region = region_from_cameras([CAMERA] * 12, poses)
-    np.testing.assert_allclose(region.centre, shift, atol=1e-6)
-    half_view = np.arctan(12 / 25)
-    assert region.radius == pytest.approx(np.sqrt(10) * np.sin(half_view), rel=1e-9)
-
-
-def test_region_leaves_the_nearest_camera_outside() -> None:
-    wide = Camera(24, 18, 5.0, 5.0, 11.5, 8.5)
-    poses = [*ring(8), look_at((0.0, 1.2, 0.4))]
-    region = region_from_cameras([wide] * 9, poses)
-    assert min(np.linalg.norm(pose[:3, 3] - region.centre) for pose in poses) > region.radius
-
-
-def test_sparse_points_fit_the_region_to_what_is_there() -> None:
-    random = np.random.default_rng(0)
-    poses = ring(12)
-    seen = region_from_cameras([CAMERA] * 12, poses)
-    positions = np.stack([pose[:3, 3] for pose in poses])
-    directions = random.normal(size=(4000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    thing = np.array([0.2, -0.1, 0.3]) + 0.5 * directions[:2000]
-    walls, strays = 8.0 * directions[2000:], random.uniform(-0.9, 0.9, (40, 3))
-    region = region_from_points(np.concatenate([thing, walls, strays]), seen, positions)
-    np.testing.assert_allclose(region.centre, (0.2, -0.1, 0.3), atol=0.05)
-    assert 0.5 < region.radius < 0.62 < seen.radius
-
-
-def test_sparse_points_leave_cameras_outside_and_few_say_nothing() -> None:
-    poses = ring(12)
-    seen = region_from_cameras([CAMERA] * 12, poses)
-    positions = np.stack([pose[:3, 3] for pose in poses])
-    everywhere = np.random.default_rng(0).uniform(-4, 4, (5000, 3))
-    region = region_from_points(everywhere, seen, positions)
-    assert region.radius <= seen.radius and np.linalg.norm(positions - region.centre, axis=1).min() > region.radius
-    assert region_from_points(everywhere[:40], seen, positions) == seen
-    assert region_from_points(np.zeros((100, 3)), seen, positions) == seen  # all in one place: no size
-
-
-DEGENERATE: dict[str, Callable[[], list[np.ndarray]]] = {
-    "one camera": lambda: [look_at((3.0, 0.0, 1.0))],
-    "one camera twice": lambda: [look_at((3.0, 0.0, 1.0))] * 2,
-    "parallel axes": lambda: [look_at((3.0, y, 0.0), (0.0, y, 0.0)) for y in (0.0, 0.5, 1.0)],
-    "looking outwards": lambda: [look_at(pose[:3, 3], 2 * pose[:3, 3]) for pose in ring(8)],
-    "panorama": lambda: [look_at((0.0, 0.0, 0.0), (np.cos(a), np.sin(a), 0.0)) for a in np.arange(6)],
-}
-
-
-@pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_cameras_give_a_finite_region(name: str) -> None:
-    poses = DEGENERATE[name]()
-    region = region_from_cameras([CAMERA] * len(poses), poses)
-    assert np.isfinite([*region.centre, region.radius]).all() and 0.01 < region.radius < 100
-    if name == "one camera":
-        ahead = np.linalg.inv(poses[0]) @ [*region.centre, 1.0]
-        np.testing.assert_allclose(ahead[:3], (0, 0, 1), atol=1e-12)
+        rigid_pose(bad, "here")

@@ -209,3 +209,12 @@ def test_frames_smaller_than_a_window_are_refused() -> None:
     raw = np.full((3, 4), 100.0)
     with pytest.raises(InputError, match="usable values"):
         photon_transfer_of_frames([(raw, raw[..., None])], NONE, 12, 64.0)
+
+
+def test_a_pixel_without_a_ray_costs_its_window_alone() -> None:
+    frames = _frames(_model(), 2, 1, "nowhere", RGGB, rough=False)
+    whole = photon_transfer_of_frames(frames, RGGB, 12, 64.0)
+    for _, expected in frames:
+        expected[4, 4] = np.nan
+    found = photon_transfer_of_frames(frames, RGGB, 12, 64.0)
+    assert found.gain_sd < 1.01 * whole.gain_sd and abs(found.gain_dn_e - whole.gain_dn_e) < 0.1 * whole.gain_sd

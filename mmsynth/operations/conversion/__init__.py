@@ -1,4 +1,4 @@
 """One modality into another.
 
-Start with ``methods`` (tensors and single frames); ``files`` converts the frames of a scene on disk.
+Start with ``methods`` (tensors and single frames); ``files`` converts frames on disk, ``register`` finds the pose of frames that have none.
 """

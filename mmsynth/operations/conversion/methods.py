@@ -16,9 +16,8 @@ the gain is shrunk to 1 by as much as frame and rendering agree within their noi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import cv2
 import numpy as np
@@ -26,17 +25,19 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion.guidance import Guide, contrast, guide, linear_map
+from mmsynth.operations.conversion.guidance import Guide, gain_exponent, guide, linear_map
+from mmsynth.operations.output.progress import RaysDone
 from mmsynth.operations.views.coverage import TrainingRays, coverage
 from mmsynth.operations.views.visibility import SAME_SURFACE
-from mmsynth.scene.scene import Sensor, canonical_modality
+from mmsynth.scene.scene import PosedCamera, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera, project, surface_points
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
 
-METHODS = ("auto", "field", "ratio", "guided")
-_CARRIED = 0.6  # of a correction is right where it arrives through the surface: measured, on two scenes with ground truth
+Method = Literal["auto", "field", "ratio", "guided"]
+METHODS: tuple[Method, ...] = get_args(Method)
+_WARPED_SHARE = 0.6  # of a correction is right where it arrives through the surface: measured, on two scenes with ground truth
 _SURE = 0.1  # relative deviation at which confidence has fallen to exp(-1/2)
 
 
@@ -52,7 +53,7 @@ class Converted:
         exposure: of the source frame, in units of the frames that the field learned from. opacity, valid: of the rendering.
     """
 
-    method: str
+    method: Method
     values: np.ndarray
     stokes: np.ndarray | None
     confidence: np.ndarray
@@ -77,7 +78,7 @@ class Conversion:
     guided: Tensor
     valid: Tensor
     exposure: Tensor
-    method: str
+    method: Method
 
 
 def convert(
@@ -87,7 +88,7 @@ def convert(
     source: str,
     target: str,
     poses: Tensor,
-    method: str = "auto",
+    method: Method = "auto",
     camera: Camera | None = None,
     target_poses: Tensor | None = None,
     target_camera: Camera | None = None,
@@ -108,27 +109,28 @@ def convert(
         raise InputError(f"convert: frames {tuple(frames.shape)}, poses {tuple(poses.shape)}; expected (B, C, H, W) and (B, 4, 4), B > 0.")
     if target_poses is not None and target_poses.shape != poses.shape:
         raise InputError(f"convert: target_poses {tuple(target_poses.shape)}, expected {tuple(poses.shape)}.")
-    there = target_camera or field.cameras[target]
-    found = []
+    converted = []
     for i, frame in enumerate(frames.detach().cpu().double().numpy()):
         raw = frame[0] if field.sensors[source].mosaic is not None and len(frame) == 1 else np.moveaxis(frame, 0, -1)
-        seen_by = None if target_poses is None else (there, target_poses[i].detach().cpu().double().numpy())
-        pose = poses[i].detach().cpu().double().numpy()
-        found.append(convert_frame(field, raw, camera or field.cameras[source], pose, source, target, method, seen_by))
+        view = PosedCamera(camera or field.cameras[source], poses[i].detach().cpu().double().numpy())
+        seen_by = None
+        if target_poses is not None:
+            seen_by = PosedCamera(target_camera or field.cameras[target], target_poses[i].detach().cpu().double().numpy())
+        converted.append(convert_frame(field, raw, view, source=source, target=target, method=method, seen_by=seen_by))
     images = lambda arrays: torch.from_numpy(np.stack(arrays)).to(frames.device).movedim(-1, 1)
-    stokes = [c.stokes for c in found if c.stokes is not None]
+    stokes = [c.stokes for c in converted if c.stokes is not None]
     return Conversion(
-        values=images([c.values for c in found]),
+        values=images([c.values for c in converted]),
         stokes=images(stokes) if stokes else None,
-        confidence=images([c.confidence[..., None] for c in found]),
-        guided=images([c.guided[..., None] for c in found]),
-        valid=images([c.valid[..., None] for c in found]),
-        exposure=torch.tensor([c.exposure for c in found], device=frames.device),
-        method=found[0].method,
+        confidence=images([c.confidence[..., None] for c in converted]),
+        guided=images([c.guided[..., None] for c in converted]),
+        valid=images([c.valid[..., None] for c in converted]),
+        exposure=torch.tensor([c.exposure for c in converted], device=frames.device),
+        method=converted[0].method,
     )
 
 
-def chosen_method(method: str, source: Sensor, target: Sensor) -> str:
+def chosen_method(method: Method, source: Sensor, target: Sensor) -> Method:
     """What ``auto`` stands for.
 
     Raises:
@@ -145,18 +147,18 @@ def chosen_method(method: str, source: Sensor, target: Sensor) -> str:
 def convert_frame(
     field: Field,
     raw: np.ndarray,
-    camera: Camera,
-    pose: np.ndarray,
+    view: PosedCamera,
+    *,
     source: str,
     target: str,
-    method: str = "auto",
-    seen_by: tuple[Camera, np.ndarray] | None = None,
-    progress: Callable[[int], None] | None = None,
+    method: Method = "auto",
+    seen_by: PosedCamera | None = None,
+    progress: RaysDone | None = None,
 ) -> Converted:
     """Convert one frame.
 
     Args:
-        raw: (H, W) of a mosaicked source, else (H, W, C), linear, 1.0 = full scale. camera, pose: of the frame; (4, 4), scene frame.
+        raw: (H, W) of a mosaicked source, else (H, W, C), linear, 1.0 = full scale. view: camera and pose of the frame.
         source, target: modalities of the field. seen_by: camera and pose of the target, None: the source's own pixels.
         progress: called with the number of rays done since the last call.
     Raises:
@@ -166,43 +168,39 @@ def convert_frame(
     field.check_modalities([source, target])
     sensor = field.sensors[source]
     used = chosen_method(method, sensor, field.sensors[target])
-    expected = (camera.height, camera.width) + (() if sensor.mosaic is not None else (sensor.channel_count,))
+    expected = (view.camera.height, view.camera.width) + (() if sensor.mosaic is not None else (sensor.channel_count,))
     if raw.shape != expected:
         raise InputError(f"convert: a frame of shape {raw.shape}, expected {expected} of {source}.")
-    seen = field.render(camera, pose, list(dict.fromkeys((source, target))), geometry=False, progress=progress)
-    hint = guide(raw, seen.channels[source], sensor, seen.valid)
+    both = list(dict.fromkeys((source, target)))
+    seen = field.render(view.camera, view.camera_to_world, both, geometry=False, progress=progress)
+    guidance = guide(raw, seen.channels[source], sensor, seen.valid)
     of_light = field.sensors[target].is_polarization  # one gain for all of a Stokes vector
     gain = np.ones((*seen.valid.shape, 1 if of_light else field.sensors[target].channel_count))
-    more = np.zeros((*seen.valid.shape, field.sensors[target].channel_count))
+    colour = np.zeros((*seen.valid.shape, field.sensors[target].channel_count))
     if used != "field":
         shown = seen.channels[target].mean(-1, keepdims=True) if of_light else seen.channels[target]
-        gain = np.maximum(hint.gain, 1e-3)[..., None] ** contrast(seen.channels[source], shown, seen.valid)
+        gain = np.maximum(guidance.gain, 1e-3)[..., None] ** gain_exponent(seen.channels[source], shown, seen.valid)
     if used == "guided" and not of_light:
-        more = (linear_map(seen.channels[source], seen.channels[target], seen.valid) @ hint.rest[..., None])[..., 0]
+        local_map = linear_map(seen.channels[source], seen.channels[target], seen.valid)
+        colour = (local_map @ guidance.residual_colour[..., None])[..., 0]
     if seen_by is None:
-        maps = gain, more, hint.gain_sd
-        return _put_together(field, target, used, seen, maps, seen.valid & ~hint.strange, hint.strange, hint)
-    there = field.render(*seen_by, [target], geometry=False, progress=progress)
-    gain, more = gain**_CARRIED, more * _CARRIED
-    layers = np.dstack([gain, more, hint.gain_sd, seen.valid, hint.strange])
-    carried, visible = _carried(layers, seen, (camera, pose), there, seen_by)
-    strange = visible & (carried[..., -1] > 0.5)
-    maps = carried[..., : gain.shape[-1]], carried[..., gain.shape[-1] : -3], carried[..., -3]
-    return _put_together(field, target, used, there, maps, visible & (carried[..., -2] > 0.99) & ~strange, strange, hint)
+        guided = seen.valid & ~guidance.unexplained
+        return _corrected(field, target, used, seen, gain, colour, guidance.gain_sd, guided, guidance.unexplained, guidance)
+    there = field.render(seen_by.camera, seen_by.camera_to_world, [target], geometry=False, progress=progress)
+    gain, colour = gain**_WARPED_SHARE, colour * _WARPED_SHARE
+    layers = np.dstack([gain, colour, guidance.gain_sd, seen.valid, guidance.unexplained])
+    warped, visible = _warped(layers, seen, view, there, seen_by)
+    unexplained = visible & (warped[..., -1] > 0.5)
+    guided = visible & (warped[..., -2] > 0.99) & ~unexplained
+    gain, colour, gain_sd = warped[..., : gain.shape[-1]], warped[..., gain.shape[-1] : -3], warped[..., -3]
+    return _corrected(field, target, used, there, gain, colour, gain_sd, guided, unexplained, guidance)
 
 
-def render_frame(
-    field: Field,
-    rays: TrainingRays,
-    camera: Camera,
-    pose: np.ndarray,
-    target: str,
-    progress: Callable[[int], None] | None = None,
-) -> Converted:
+def render_frame(field: Field, rays: TrainingRays, view: PosedCamera, target: str, *, progress: RaysDone | None = None) -> Converted:
     """What the target sensor would have seen at a pose where there is no frame: the field alone. Confidence is coverage by the training
     frames (see ``coverage``), 0 without a surface."""
-    seen = field.render(camera, pose, [target], geometry=True, progress=progress)
-    covered = coverage(rays, camera, pose, seen.depth_ray, seen.normal)
+    seen = field.render(view.camera, view.camera_to_world, [target], geometry=True, progress=progress)
+    covered = coverage(rays, view, seen.depth_ray, seen.normal)
     return Converted(
         method="field",
         values=seen.channels[target],
@@ -215,50 +213,50 @@ def render_frame(
     )
 
 
-def _put_together(
+def _corrected(
     field: Field,
     target: str,
-    used: str,
+    used: Method,
     seen: Rendering,
-    maps: tuple[np.ndarray, np.ndarray, np.ndarray],
-    told: np.ndarray,
-    strange: np.ndarray,
-    hint: Guide,
+    gain: np.ndarray,
+    colour: np.ndarray,
+    gain_sd: np.ndarray,
+    guided: np.ndarray,
+    unexplained: np.ndarray,
+    guidance: Guide,
 ) -> Converted:
-    """``told``: where the frame has a say. ``strange``: where it shows what the field does not have."""
-    gain, more = np.where(told[..., None], maps[0], 1.0), np.where(told[..., None], maps[1], 0.0)
-    values = np.maximum(seen.channels[target] * gain + more, 0.0)  # NaN stays
+    """A rendering, times ``gain`` and plus ``colour`` where the frame has a say (``guided``)."""
+    gain, colour = np.where(guided[..., None], gain, 1.0), np.where(guided[..., None], colour, 0.0)
+    values = np.maximum(seen.channels[target] * gain + colour, 0.0)  # NaN stays
     stokes = seen.stokes[target] * gain if field.sensors[target].is_polarization else None
     # where the frame says nothing the field is as sure as it proved to be elsewhere
-    deviation = np.where(told, maps[2], hint.prior_sd)
-    sure = np.exp(-0.5 * (deviation / _SURE) ** 2)
+    deviation = np.where(guided, gain_sd, guidance.prior_sd)
+    confidence = np.exp(-0.5 * (deviation / _SURE) ** 2)
     return Converted(
         method=used,
         values=values.astype(np.float32),
         stokes=None if stokes is None else stokes.astype(np.float32),
-        confidence=np.where(seen.valid & ~strange, sure, 0.0).astype(np.float32),
-        guided=told if used != "field" else np.zeros_like(told),
-        exposure=hint.exposure,
+        confidence=np.where(seen.valid & ~unexplained, confidence, 0.0).astype(np.float32),
+        guided=guided if used != "field" else np.zeros_like(guided),
+        exposure=guidance.exposure,
         opacity=seen.opacity,
         valid=seen.valid,
     )
 
 
-def carried_through(
-    field: Field, values: np.ndarray, frame: tuple[Camera, np.ndarray], seen_by: tuple[Camera, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def warp_through_surface(field: Field, values: np.ndarray, view: PosedCamera, seen_by: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
     """Values (H, W, M) of one camera's pixels → on another's, through the field's surface; and where it sees the same surface."""
-    seen, there = (field.render(*by, [], geometry=False) for by in (frame, seen_by))
-    return _carried(np.where(seen.valid[..., None], values, 0.0), seen, frame, there, seen_by)
+    seen, there = (field.render(at.camera, at.camera_to_world, [], geometry=False) for at in (view, seen_by))
+    return _warped(np.where(seen.valid[..., None], values, 0.0), seen, view, there, seen_by)
 
 
-def _carried(
-    layers: np.ndarray, seen: Rendering, frame: tuple[Camera, np.ndarray], there: Rendering, seen_by: tuple[Camera, np.ndarray]
+def _warped(
+    layers: np.ndarray, seen: Rendering, view: PosedCamera, there: Rendering, seen_by: PosedCamera
 ) -> tuple[np.ndarray, np.ndarray]:
     """Layers (H, W, M) of the source's pixels → on the target's, through the surface; and where the source sees the same surface."""
-    camera, pose = frame
-    local = (surface_points(*seen_by, there.depth_ray) - pose[:3, 3]) @ pose[:3, :3]
-    pixels = project(local, camera)
+    pose = view.camera_to_world
+    local = (surface_points(seen_by.camera, seen_by.camera_to_world, there.depth_ray) - pose[:3, 3]) @ pose[:3, :3]
+    pixels = project(local, view.camera)
     inside = np.isfinite(pixels).all(-1)  # NaN: no surface, or out of the lens
     at = np.where(inside[..., None], pixels, -10.0).astype(np.float32)
     sample = lambda image, how: cv2.remap(np.ascontiguousarray(image, np.float32), at[..., 0], at[..., 1], how, borderValue=0)

@@ -26,11 +26,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -38,74 +38,115 @@ from mmsynth.errors import InputError
 from mmsynth.files import sha256_of, write_json
 from mmsynth.operations.dataset.index import PER_SHARD, drop_views, finished_shard, finished_view, pack_shard, shard_name, view_folder
 from mmsynth.operations.output.previews import preview_linear
-from mmsynth.operations.output.progress import Counter, Progress
-from mmsynth.operations.output.records import FORMATS as RECORD_FORMATS
+from mmsynth.operations.output.progress import Counter, Progress, RaysDone
 from mmsynth.operations.output.records import (
     UNITS,
+    RecordFormat,
     field_hash,
     modality_arrays,
     read_record,
     write_record,
 )
-from mmsynth.operations.output.work_partition import Share
+from mmsynth.operations.output.work_partition import WorkPartition
 from mmsynth.operations.simulation.simulate import simulate
-from mmsynth.operations.views.coverage import TrainingRays, coverage
+from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, training_rays, view_scores
 from mmsynth.operations.views.flow import optical_flow
-from mmsynth.operations.views.trajectories import View
-from mmsynth.scene.images import write_png16
+from mmsynth.operations.views.load import RIGS, Rig, load_views, on_the_rig
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.layouts.mmsdata import meta_content
-from mmsynth.scene.poses import OPENGL_TO_OPENCV
-from mmsynth.scene.scene import PosedCamera, canonical_modality
+from mmsynth.scene.layouts.nerfstudio import transforms_content
+from mmsynth.scene.scene import PosedCamera, Scene, canonical_modality
 from mmsynth.scene.serialisation import CONVENTIONS, channels_to_json, posed_to_json
-from mmsynth.sensors.camera import Camera
 from mmsynth.version import __version__
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
 
-RIGS = ("aligned", "native")
-FORMATS = (*RECORD_FORMATS, "webdataset", "mms-data")
+DatasetFormat = Literal[RecordFormat, "webdataset", "mms-data"]
+DATASET_FORMATS: tuple[DatasetFormat, ...] = get_args(DatasetFormat)
 OUTPUTS = ("geometry", "flow", "coverage")
 LAYOUT = 2
 
-Placed = dict[str, tuple[Camera, np.ndarray]]  # camera and pose of each modality at one view
+Placed = dict[str, PosedCamera]  # of each modality at one view
+
+
+@dataclass(frozen=True)
+class GeneratedDataset:
+    """What a request made.
+
+    Attributes:
+        path: of ``dataset.json``; None where other processes have not finished their views yet: the last one writes it.
+        views: how many. left_out: name and coverage score of those that the training frames cover too little.
+    """
+
+    path: Path | None
+    views: int
+    left_out: tuple[tuple[str, float], ...] = ()
 
 
 def generate_dataset(
     field: Field,
-    views: Sequence[View],
+    views: Sequence[PosedCamera] | Path | str,
     out: Path | str,
+    *,
+    scene: Scene | None = None,
     modalities: Sequence[str] | None = None,
-    rig: str = "aligned",
-    format: str = "npz",
+    rig: Rig = "aligned",
+    file_format: DatasetFormat = "npz",
     outputs: Sequence[str] | None = None,
+    min_coverage: float | None = None,
     rays: TrainingRays | None = None,
     sensors: Sequence[str | Path] = (),
     seed: int = 0,
-    share: Share | None = None,
+    part: WorkPartition | None = None,
     progress: Progress | None = None,
-) -> Path | None:
+) -> GeneratedDataset:
     """Render all modalities at all views and write them as a dataset (layout: module docstring).
 
     Args:
-        views: (camera, camera_to_world, name); ``trajectories.load_views`` makes them.
+        views: where to look from, or the file of their poses (see ``load_views``).
+        scene: the one that the field was fitted to: its training frames are what coverage is judged by, and a trajectory starts from.
         modalities: names or aliases; None: all of the field.
-        rig: "aligned": every modality on the view's own pixel grid; "native": the view is the reference sensor's and every other
-            modality is seen by its own camera from its own place on the rig.
-        format: "npz", "exr" (named float channels), "tiff" (16-bit images, float geometry), "webdataset" or "mms-data".
-        outputs: of "geometry", "flow" and "coverage", what is wanted beside the modalities; None: all of it, coverage with ``rays`` only.
-        rays: of the training frames (``coverage.training_rays``). sensors: files of those whose raw frames at these views go into raw/, a
-            scene of its own (see ``simulate``, also for ``seed``). share: the part of the views that this process renders, None: all.
-        progress: called with (rays done, rays in all); finished views count at once. Raw frames come after them, and count anew.
-    Returns:
-        the path of ``dataset.json``; None where other processes have not finished their views yet: the last one writes it.
+        rig: of what the views are, see ``Rig``; on the native rig, of the field's first sensor.
+        file_format: "npz", "exr" (named float channels), "tiff" (16-bit images, float geometry), "webdataset" or "mms-data".
+        outputs: of "geometry", "flow" and "coverage", what is wanted beside the modalities; None: all of it, coverage with a scene only.
+        min_coverage: leave out views that the training frames cover less, in [0, 1]; 1 = their own pixels (see ``coverage.view_score``).
+        rays: of the training frames, where they were made already (``coverage.training_rays``); None: of the scene.
+        sensors: files of those whose raw frames at these views go into raw/, a scene of its own (see ``simulate``, also for ``seed``).
+        part: the views that this process renders, None: all.
+        progress: called with (rays done, rays in all); finished views count at once. What coverage takes comes before the views, raw frames
+            after them, and each counts anew.
     Raises:
-        InputError: no views, unknown modality, rig, format or output, a modality without a place on the rig, a camera that the format
-            does not hold, or the disk refused.
+        InputError: no views, or none that is covered enough; unknown modality, rig, format or output; a modality without a place on the
+            rig; a camera that the format does not hold; coverage without a scene; or the disk refused.
     """
-    plan = _planned(field, views, Path(out), modalities, rig, format, outputs, rays)
-    mine = (share or Share()).of(len(views), PER_SHARD if format == "webdataset" else 1)
-    costs = [sum(cameras[group[0]][0].width * cameras[group[0]][0].height for group in plan.groups) for cameras in plan.placed]
+    if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
+        raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
+    names, wanted = _checked(field, modalities, rig, file_format, outputs)
+    views = load_views(views, field, scene)
+    if not views:
+        raise InputError("dataset: no views, expected at least one.")
+    if rays is None and scene is not None and (min_coverage is not None or "coverage" in wanted):
+        rays = training_rays(field, scene, progress=progress)
+    if rays is None and (min_coverage is not None or (outputs is not None and "coverage" in wanted)):
+        raise InputError("dataset: coverage needs the rays of the training frames, expected the scene.")
+    left_out: list[tuple[str, float]] = []
+    if min_coverage is not None and rays is not None:
+        views, left_out = covered_views(views, view_scores(field, rays, views, progress), min_coverage)
+    plan = _planned(field, views, Path(out), names, rig, file_format, wanted, rays)
+    part = part or WorkPartition()
+    _write_views(plan, part, progress)
+    raw = simulate(field, sensors, plan.out / "raw", views=views, rig=rig, seed=seed, part=part, progress=progress) if sensors else None
+    path = None if sensors and raw is None else _summary(plan, raw, seed)
+    return GeneratedDataset(path, len(views), tuple(left_out))
+
+
+def _write_views(plan: _Plan, part: WorkPartition, progress: Progress | None) -> None:
+    """Render and write the views of this process that are not there yet, and pack them, where the format says so."""
+    packed = plan.format == "webdataset"
+    mine = part.of(len(plan.placed), PER_SHARD if packed else 1)
+    cameras = [[placed[group[0]].camera for group in plan.groups] for placed in plan.placed]
+    costs = [sum(camera.width * camera.height for camera in of_view) for of_view in cameras]
     count = Counter(progress, sum(costs[i] for i in mine))
     ahead: dict[int, list[Rendering]] = {}  # the next view, rendered already for the flow to it
     goal = 0
@@ -117,13 +158,11 @@ def generate_dataset(
             following = _following(plan, index, index + 1 in mine, ahead, count)
             _write_view(plan, index, here, following)
         count(max(0, goal - count.done))
-        if format == "webdataset" and (index + 1 in (mine.stop, len(views)) or (index + 1) % PER_SHARD == 0):
+        if packed and (index + 1 in (mine.stop, len(plan.placed)) or (index + 1) % PER_SHARD == 0):
             first = index // PER_SHARD * PER_SHARD
             if plan.shard(index) is None:
                 pack_shard(plan.out, shard_name(index), range(first, index + 1))
                 plan.shard(index)
-    raw = simulate(field, sensors, views, plan.out / "raw", seed, rig=rig, share=share, progress=progress) if sensors else None
-    return None if sensors and raw is None else _summary(plan, raw, seed)
 
 
 @dataclass(frozen=True)
@@ -133,8 +172,8 @@ class _Plan:
 
     field: Field
     out: Path
-    rig: str
-    format: str
+    rig: Rig
+    format: DatasetFormat
     outputs: tuple[str, ...]
     rays: TrainingRays | None
     request: dict[str, Any]
@@ -163,34 +202,36 @@ class _Plan:
         return self.shards[name]
 
 
-def _planned(
-    field: Field,
-    views: Sequence[View],
-    out: Path,
-    modalities: Sequence[str] | None,
-    rig: str,
-    format: str,
-    outputs: Sequence[str] | None,
-    rays: TrainingRays | None,
-) -> _Plan:
+def _checked(
+    field: Field, modalities: Sequence[str] | None, rig: Rig, file_format: DatasetFormat, outputs: Sequence[str] | None
+) -> tuple[list[str], tuple[str, ...]]:
+    """Canonical names of the modalities, and the outputs in their order; what cannot be made is said before anything is rendered."""
     if rig not in RIGS:
         raise InputError(f"dataset: rig is {rig!r}, expected one of {', '.join(RIGS)}.")
-    if format not in FORMATS:
-        raise InputError(f"dataset: format is {format!r}, expected one of {', '.join(FORMATS)}.")
-    if not views:
-        raise InputError("dataset: no views, expected at least one.")
+    if file_format not in DATASET_FORMATS:
+        raise InputError(f"dataset: format is {file_format!r}, expected one of {', '.join(DATASET_FORMATS)}.")
     names = field.check_modalities(None if modalities is None else [canonical_modality(m) for m in modalities])
     if not names:
         raise InputError("dataset: no modalities, expected at least one.")
-    wanted = tuple(o for o in OUTPUTS if outputs is None or o in outputs)
     unknown = [o for o in outputs or () if o not in OUTPUTS]
     if unknown:
         raise InputError(f"dataset: output {unknown[0]!r}, expected some of {', '.join(OUTPUTS)}.")
-    if rays is None and outputs is not None and "coverage" in wanted:
-        raise InputError("dataset: coverage needs the rays of the training frames, expected them with it.")
+    return names, tuple(o for o in OUTPUTS if outputs is None or o in outputs)
+
+
+def _planned(
+    field: Field,
+    views: Sequence[PosedCamera],
+    out: Path,
+    names: Sequence[str],
+    rig: Rig,
+    file_format: DatasetFormat,
+    wanted: tuple[str, ...],
+    rays: TrainingRays | None,
+) -> _Plan:
     wanted = tuple(o for o in wanted if o != "coverage" or rays is not None)
-    placed = [_place(field, names, camera, pose, rig) for camera, pose, _ in views]
-    if format == "mms-data":
+    placed = [_place(field, names, view, rig) for view in views]
+    if file_format == "mms-data":
         _meta(field, out, names, placed)  # what it does not hold is said before anything is rendered
     fit = {key: field.manifest.get(key) for key in ("recipe", "seed", "scene", "steps")}
     request = {
@@ -198,7 +239,7 @@ def _planned(
         "field": field_hash(field),
         "fit": fit,
         "rig": rig,
-        "format": format,
+        "format": file_format,
         "outputs": list(wanted),
         "modalities": {name: channels_to_json(field.sensors[name]) for name in names},
         "unit": field.unit,
@@ -206,54 +247,44 @@ def _planned(
         "versions": {"mmsynth": __version__} | {package: version(package) for package in ("numpy", "torch")},
     }
     stated = [
-        {"name": name, "cameras": {m: posed_to_json(PosedCamera(c, p)) for m, (c, p) in cameras.items()}}
-        for (_, _, name), cameras in zip(views, placed, strict=True)
+        {"name": view.name, "cameras": {m: posed_to_json(seen_by) for m, seen_by in cameras.items()}}
+        for view, cameras in zip(views, placed, strict=True)
     ]
-    known = json.dumps(request, sort_keys=True)
+    request_text = json.dumps(request, sort_keys=True)
     seen_from = None if rays is None or "coverage" not in wanted else hashlib.sha256(rays.poses.tobytes()).hexdigest()
     # the flow of a view depends on where the next one is
     following = [view["cameras"] if "flow" in wanted else None for view in stated[1:]] + [None]
     keys = [
-        hashlib.sha256(json.dumps([known, seen_from, view, after], sort_keys=True).encode()).hexdigest()
+        hashlib.sha256(json.dumps([request_text, seen_from, view, after], sort_keys=True).encode()).hexdigest()
         for view, after in zip(stated, following, strict=True)
     ]
     groups = [list(names)] if rig == "aligned" else [[name] for name in names]
-    return _Plan(field, out, rig, format, wanted, rays, request, groups, placed, stated, keys, {})
+    return _Plan(field, out, rig, file_format, wanted, rays, request, groups, placed, stated, keys, {})
 
 
-def _place(field: Field, names: Sequence[str], camera: Camera, pose: np.ndarray, rig: str) -> Placed:
+def _place(field: Field, names: Sequence[str], view: PosedCamera, rig: Rig) -> Placed:
     """Camera and pose of each modality at one view."""
-    if rig == "aligned":
-        return dict.fromkeys(names, (camera, pose))
     reference = next(iter(field.sensors))
-    out = {}
-    for name in names:
-        if name == reference:
-            out[name] = (camera, pose)
-        elif name in field.rig and name in field.cameras:
-            out[name] = (field.cameras[name], pose @ field.rig[name])
-        else:
-            raise InputError(f"dataset: modality {name!r} has no known place on the rig of {reference!r}, expected --rig aligned.")
-    return out
+    own = lambda name: rig == "aligned" or name == reference
+    return {name: view if own(name) else on_the_rig(field, view, reference, name) for name in names}
 
 
-def _of(stem: str, modality: str, rig: str) -> str:
+def _of(stem: str, modality: str, rig: Rig) -> str:
     """File stem: on the native rig, one per modality."""
     return stem if rig == "aligned" else f"{stem}_{modality}"
 
 
-def _render(plan: _Plan, index: int, progress: Callable[[int], None] | None, modalities: bool = True) -> list[Rendering]:
+def _render(plan: _Plan, index: int, progress: RaysDone | None, modalities: bool = True) -> list[Rendering]:
     """Each group of modalities of a view, or its geometry alone."""
     geometry = bool(plan.outputs)
-    return [
-        plan.field.render(*plan.placed[index][group[0]], group if modalities else [], geometry=geometry, progress=progress)
-        for group in plan.groups
-    ]
+    out = []
+    for group in plan.groups:
+        at, names = plan.placed[index][group[0]], group if modalities else []
+        out.append(plan.field.render(at.camera, at.camera_to_world, names, geometry=geometry, progress=progress))
+    return out
 
 
-def _following(
-    plan: _Plan, index: int, mine: bool, ahead: dict[int, list[Rendering]], progress: Callable[[int], None]
-) -> list[np.ndarray] | None:
+def _following(plan: _Plan, index: int, mine: bool, ahead: dict[int, list[Rendering]], progress: RaysDone) -> list[np.ndarray] | None:
     """depth_ray of the next view, by group: rendered now and kept, where it is still to be made, else read from what was made."""
     if "flow" not in plan.outputs or index + 1 == len(plan.placed):
         return None
@@ -275,29 +306,29 @@ def _write_view(plan: _Plan, index: int, renderings: Sequence[Rendering], follow
     (folder / "view.json").unlink(missing_ok=True)
     files: dict[str, Any] = {}
     scores = []
-    record_format = "npz" if plan.format in ("webdataset", "mms-data") else plan.format
+    record_format: RecordFormat = "npz" if plan.format == "webdataset" or plan.format == "mms-data" else plan.format
     units = UNITS | {"depth_z": plan.field.unit, "depth_ray": plan.field.unit}
     for number, (group, rendering) in enumerate(zip(plan.groups, renderings, strict=True)):
-        camera, pose = plan.placed[index][group[0]]
+        at = plan.placed[index][group[0]]
         for name in group:
             files |= _write_modality(plan, index, name, rendering, record_format)
         if "geometry" in plan.outputs:
-            arrays = _geometry_arrays(rendering, pose)
+            arrays = _geometry_arrays(rendering, at.camera_to_world)
             for name in group:
                 clipped = rendering.channels[name] >= min(plan.field.sensors[name].saturation, 1.0)
                 arrays[f"saturated_{name}"] = np.asarray(clipped.any(-1))
             if "coverage" in plan.outputs and plan.rays is not None:
-                arrays["coverage"] = coverage(plan.rays, camera, pose, rendering.depth_ray, rendering.normal)
+                arrays["coverage"] = coverage(plan.rays, at, rendering.depth_ray, rendering.normal)
                 hit = arrays["coverage"][np.isfinite(arrays["coverage"])]
                 scores.append(float(hit.mean(dtype=np.float64)) if hit.size else 0.0)
-            files |= write_record(folder, _of("geometry", group[0], plan.rig), arrays, record_format, units)
+            files |= write_record(folder, _of("geometry", group[0], plan.rig), arrays, record_format, units=units)
         if following is not None:
             there = plan.placed[index + 1][group[0]]
-            flow, occluded = optical_flow(camera, pose, rendering.depth_ray, rendering.normal, *there, following[number])
-            files |= write_record(folder, _of("flow", group[0], plan.rig), {"flow": flow, "occluded": occluded}, record_format, units)
+            flow, occluded = optical_flow(at, rendering.depth_ray, rendering.normal, there, following[number])
+            files |= write_record(folder, _of("flow", group[0], plan.rig), {"flow": flow, "occluded": occluded}, record_format, units=units)
         picture = folder / f"{_of('image', group[0], plan.rig)}.png"
         write_png16(picture, preview_linear(plan.field.sensors[group[0]], rendering.channels[group[0]]))
-        shown = {"shape": [camera.height, camera.width, 3], "dtype": "uint16", "unit": "full scale"}
+        shown = {"shape": [at.camera.height, at.camera.width, 3], "dtype": "uint16", "unit": "full scale"}
         files[picture.name] = {
             "record": picture.stem,
             "sha256": sha256_of(picture),
@@ -308,14 +339,14 @@ def _write_view(plan: _Plan, index: int, renderings: Sequence[Rendering], follow
     write_json(folder / "view.json", {"request": plan.keys[index], **plan.stated[index], **score, "files": files})
 
 
-def _write_modality(plan: _Plan, index: int, name: str, rendering: Rendering, format: str) -> dict[str, Any]:
+def _write_modality(plan: _Plan, index: int, name: str, rendering: Rendering, record_format: RecordFormat) -> dict[str, Any]:
     sensor, folder = plan.field.sensors[name], plan.out / view_folder(index)
     arrays = modality_arrays(rendering.channels[name], rendering.stokes.get(name))
     if plan.format != "mms-data":
-        return write_record(folder, name, arrays, format, UNITS, sensor)
-    frame = write_record(plan.out / "modalities" / name, f"{index:04d}", {"data": arrays.pop("data")}, "tiff", UNITS, sensor)
+        return write_record(folder, name, arrays, record_format, units=UNITS, sensor=sensor)
+    frame = write_record(plan.out / "modalities" / name, f"{index:04d}", {"data": arrays.pop("data")}, "tiff", units=UNITS, sensor=sensor)
     files = {f"../../modalities/{name}/{file}": facts | {"record": name} for file, facts in frame.items()}
-    return files | write_record(folder, name, arrays, format, UNITS)
+    return files | write_record(folder, name, arrays, record_format, units=UNITS)
 
 
 def _geometry_arrays(rendering: Rendering, pose: np.ndarray) -> dict[str, np.ndarray]:
@@ -348,9 +379,10 @@ def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
         views.append(where | {key: value for key, value in stated.items() if key != "request"})
     files = []
     for group in plan.groups if plan.format != "webdataset" else []:
-        poses = [cameras[group[0]] for cameras in plan.placed]
+        picture = f"{_of('image', group[0], plan.rig)}.png"
+        pictures = [replace(cameras[group[0]], name=f"{view_folder(i)}/{picture}") for i, cameras in enumerate(plan.placed)]
         files.append(out / f"{_of('transforms', group[0], plan.rig)}.json")
-        write_json(files[-1], _transforms(poses, f"{_of('image', group[0], plan.rig)}.png"))
+        write_json(files[-1], transforms_content(pictures))
     if plan.format == "mms-data":
         files.append(out / "meta_data.json")
         write_json(files[-1], _meta(plan.field, out, list(plan.request["modalities"]), plan.placed))
@@ -367,26 +399,5 @@ def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
 def _meta(field: Field, out: Path, names: Sequence[str], placed: Sequence[Placed]) -> dict[str, Any]:
     """meta_data.json of a scene whose frames have all channels at every pixel."""
     sensors = [replace(field.sensors[name], mosaic=None) for name in names]
-    frames = {name: [(i, f"{i:04d}.tiff", *cameras[name]) for i, cameras in enumerate(placed)] for name in names}
+    frames = {name: {i: replace(cameras[name], name=f"{i:04d}.tiff") for i, cameras in enumerate(placed)} for name in names}
     return meta_content(out, sensors, frames, field.region, field.unit)
-
-
-def _transforms(cameras: Sequence[tuple[Camera, np.ndarray]], picture: str) -> dict[str, Any]:
-    """nerfstudio's transforms.json: OpenGL axes, centre of the top-left pixel at (0.5, 0.5)."""
-    frames = []
-    for index, (camera, pose) in enumerate(cameras):
-        fisheye = camera.lens == "kannala_brandt"
-        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        frames.append({
-            "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-            "file_path": f"views/{index:04d}/{picture}",
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx + 0.5,
-            "cy": camera.cy + 0.5,
-            **dict(zip(names, map(float, camera.coefficients), strict=True)),
-            "transform_matrix": (np.asarray(pose) @ OPENGL_TO_OPENCV).tolist(),
-        })  # fmt: skip
-    return {"camera_model": frames[0]["camera_model"] if frames else "OPENCV", "frames": frames}

@@ -97,8 +97,8 @@ def read_dataset(out: Path) -> dict[str, Any]:
     return content
 
 
-def verify(out: Path | str) -> list[str]:
-    """Check a dataset against its ``dataset.json``: one sentence per problem, empty when all is well.
+def verify_dataset(out: Path | str) -> list[str]:
+    """Check a dataset against its ``dataset.json``, without its field or scene: one sentence per problem, empty when all is well.
 
     Every file is there with the stated size and hash; npz files hold the stated arrays; no array of numbers is infinite.
 
@@ -114,11 +114,11 @@ def verify(out: Path | str) -> list[str]:
         if "shard" in view:
             continue
         folder = out / view["folder"]
-        found = file_problems(folder, view["files"])
-        problems += found
+        of_files = file_problems(folder, view["files"])
+        problems += of_files
         if not (folder / "view.json").is_file():
             problems.append(f"{folder / 'view.json'}: missing.")
-        if not found:
+        if not of_files:
             for name, stated in view["files"].items():
                 if name.endswith(".npz"):
                     problems += _array_problems(folder / name, stated["arrays"])

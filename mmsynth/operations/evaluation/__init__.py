@@ -1,1 +1,1 @@
-"""How good a field and its conversions are."""
+"""Scores on test views: ``evaluate`` of a field, ``conversions`` of its conversions."""

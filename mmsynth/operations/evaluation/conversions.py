@@ -8,7 +8,8 @@ training poses of the source (a colour matrix of the scene); ``nearest``, the ne
 the surface, and the field where that frame does not see it.
 
 Values are clipped to [0, 1]; PSNR, RMSE, SAM, Stokes and AoLP errors are over all pixels with a ray, ``psnr_region`` over those in the
-region of interest; ERGAS (of a ratio of 1) and SSIM are torchmetrics'. Without truth, raw photosites are compared: PSNR alone.
+region of interest; SSIM is that of ``evaluate``, over pixels with a ray; ERGAS (of a ratio of 1) is torchmetrics'. Without truth, raw
+photosites are compared: PSNR alone.
 """
 
 from __future__ import annotations
@@ -19,16 +20,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis, structural_similarity_index_measure
+from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis
 
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion.methods import METHODS, Converted, carried_through, chosen_method, convert_frame
-from mmsynth.operations.evaluation.evaluate import psnr_from_mse, spectral_angle_deg
+from mmsynth.operations.conversion.methods import METHODS, Converted, chosen_method, convert_frame, warp_through_surface
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
-from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
-from mmsynth.sensors.camera import Camera
+from mmsynth.scene.scene import Frame, PosedCamera, Scene, Sensor, canonical_modality
+from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim_of_channels
 from mmsynth.sensors.mosaic import channels_of, photosites_of
 from mmsynth.sensors.polarization import (
     angle_of_linear_polarization,
@@ -42,6 +42,18 @@ if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
 _LEARNED_FROM = 8  # renderings for the linear map
+
+
+def evaluate_conversions(
+    field: Field, scene: Scene, pairs: Sequence[tuple[str, str]], *, progress: Progress | None = None
+) -> list[dict[str, Any]]:
+    """``evaluate_conversion`` of pairs of source and target; progress: called with (pairs done, pairs in all)."""
+    out = []
+    for done, (source, target) in enumerate(pairs, 1):
+        out.append(evaluate_conversion(field, scene, source, target))
+        if progress is not None:
+            progress(done, len(pairs))
+    return out
 
 
 def evaluate_conversion(
@@ -75,17 +87,17 @@ def evaluate_conversion(
         own = None if aligned else next(iter(scene.frames_of(target, (frame.view,))), None)
         if not aligned and own is None:
             continue
-        seen_by = None if own is None else (own.camera, field.pose_of(own))
-        pose = field.pose_of(frame)
+        seen_by = None if own is None else PosedCamera(own.camera, field.pose_of(own))
+        view = PosedCamera(frame.camera, field.pose_of(frame))
         light, region, kind = _truth_of(truth, field.sensors[target], frame, own)
         results: dict[str, np.ndarray] = {}
         for method in METHODS[1:]:
             began = time.perf_counter()
-            found = convert_frame(field, raw, frame.camera, pose, source, target, method, seen_by)
+            found = convert_frame(field, raw, view, source=source, target=target, method=method, seen_by=seen_by)
             seconds += (time.perf_counter() - began) * (method == used)
             results[method] = _values(found, field.sensors[target])
-        results["linear"] = _by_linear(field, raw, frame, pose, source, matrix, seen_by, results["field"])
-        results["nearest"] = _by_nearest(field, scene, target, seen_by or (frame.camera, pose), results["field"])
+        results["linear"] = _by_linear(field, raw, view, source, matrix, seen_by, results["field"])
+        results["nearest"] = _by_nearest(field, scene, target, seen_by or view, results["field"])
         for name, values in results.items():
             totals.setdefault(name, []).append(_errors(values, light, found.valid, region, field.sensors[target], kind))
         judged.append(frame.view)
@@ -144,30 +156,29 @@ def _linear(field: Field, scene: Scene, source: str, target: str) -> np.ndarray:
 def _by_linear(
     field: Field,
     raw: np.ndarray,
-    frame: Frame,
-    pose: np.ndarray,
+    view: PosedCamera,
     source: str,
     matrix: np.ndarray,
-    seen_by: tuple[Camera, np.ndarray] | None,
+    seen_by: PosedCamera | None,
     otherwise: np.ndarray,
 ) -> np.ndarray:
     channels = channels_of(raw, field.sensors[source].mosaic).astype(np.float64)
     values = np.concatenate([channels, np.ones((*channels.shape[:2], 1))], -1) @ matrix
     if seen_by is None:
         return np.asarray(values)
-    carried, visible = carried_through(field, values, (frame.camera, pose), seen_by)
+    carried, visible = warp_through_surface(field, values, view, seen_by)
     return np.where(visible[..., None], carried, otherwise)
 
 
-def _by_nearest(field: Field, scene: Scene, target: str, seen_by: tuple[Camera, np.ndarray], otherwise: np.ndarray) -> np.ndarray:
+def _by_nearest(field: Field, scene: Scene, target: str, seen_by: PosedCamera, otherwise: np.ndarray) -> np.ndarray:
     """The training frame whose camera stands nearest, carried over."""
-    pose = seen_by[1]
+    centre = seen_by.camera_to_world[:3, 3]
     frames = scene.frames_of(target, scene.split.train)
     if not frames:
         return otherwise
-    nearest = min(frames, key=lambda f: float(np.linalg.norm(field.pose_of(f)[:3, 3] - pose[:3, 3])))
+    nearest = min(frames, key=lambda f: float(np.linalg.norm(field.pose_of(f)[:3, 3] - centre)))
     values = _as_light(channels_of(load_frame(field.sensors[target], nearest)[0], field.sensors[target].mosaic), field.sensors[target])
-    carried, visible = carried_through(field, values, (nearest.camera, field.pose_of(nearest)), seen_by)
+    carried, visible = warp_through_surface(field, values, PosedCamera(nearest.camera, field.pose_of(nearest)), seen_by)
     return np.where(visible[..., None], carried, otherwise)
 
 
@@ -192,9 +203,9 @@ def _errors(
     if kind == "raw":
         return out
     out["mse_channels"] = square[valid].reshape(-1, square.shape[-1])
-    both = [torch.from_numpy(np.where(valid[..., None], x, 0.0)).movedim(-1, 0)[None].float() for x in (seen, real)]
-    if min(valid.shape) >= 11:
-        out["ssim"] = np.array([float(structural_similarity_index_measure(both[0], both[1], data_range=1.0))])  # type: ignore[arg-type]
+    similar = ssim_of_channels(real, seen, valid)
+    if similar:
+        out["ssim"] = np.array([np.mean(similar)])
     if target.is_polarization:
         ours, true = (torch.from_numpy(x[valid]) for x in (values, light))
         out["stokes"] = ((ours - true) ** 2).numpy().ravel()
@@ -205,6 +216,7 @@ def _errors(
         out["physical"] = (ours[:, 1:].norm(dim=1) <= ours[:, 0] + 1e-6).double().numpy()
     elif target.channel_count > 1:
         out["sam"] = spectral_angle_deg(values[valid], light[valid])
+        both = [torch.from_numpy(np.where(valid[..., None], x, 0.0)).movedim(-1, 0)[None].float() for x in (seen, real)]
         out["ergas"] = np.array([float(error_relative_global_dimensionless_synthesis(both[0], both[1], ratio=1.0))])
     return out
 

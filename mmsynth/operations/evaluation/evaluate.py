@@ -1,4 +1,4 @@
-"""How good a field is: test views against the raw frames, and against the noise-free truth where a scene has it.
+"""Scores of a field: test views against the raw frames, and against noise-free truth where a scene has it.
 
 Definitions (all values linear, peak 1.0 = full scale, so PSNR = -10 log10 MSE; MSE is pooled over the pixels of all test views, not
 averaged per view in dB):
@@ -9,7 +9,7 @@ averaged per view in dB):
 * ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
   mosaic per channel.
 * ``psnr_truth``, ``psnr_truth_full``: all channels at every pixel of the own pose against ``gt/<modality>``, in the region and
-  everywhere; both clipped to [0, 1], beyond which no frame could have taught the field anything.
+  everywhere; both clipped to [0, 1], the range that frames can record.
 * ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
 * ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``dolp_rmse``; ``aolp_mae``:
   circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
@@ -31,7 +31,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from skimage.metrics import structural_similarity
 
 from mmsynth.errors import InputError
 from mmsynth.operations.output.progress import Counter, Progress
@@ -39,6 +38,7 @@ from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame, read_native
 from mmsynth.scene.scene import Frame, Scene, Sensor
 from mmsynth.sensors.camera import depth_along_rays, surface_points
+from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim, ssim_of_channels
 from mmsynth.sensors.mosaic import photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
@@ -84,56 +84,14 @@ class _Scores:
         return float(np.sqrt(mean)) if key.endswith("_rmse") else mean
 
 
-def psnr_from_mse(mse: float) -> float:
-    """dB for peak 1.0; an exact match counts as 1e-12 (120 dB), because JSON has no infinity."""
-    return float(-10.0 * np.log10(max(mse, 1e-12)))
-
-
-def ssim(a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float | None:
-    """Structural similarity of two single-channel images in [0, 1], mean over valid pixels away from the border.
-
-    Gaussian window of 11 pixels (sigma 1.5); images smaller than that get the largest odd uniform window, below 3 pixels: None.
-
-    Args:
-        a, b: (H, W). valid: (H, W) bool; b takes a's values elsewhere, so that no window sees a hole.
-    """
-    window = min(11, *a.shape)
-    window -= 1 - window % 2
-    if window < 3:
-        return None
-    b = np.where(valid, b, a)
-    options: dict[str, Any] = {"win_size": window}
-    if window == 11:
-        options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    similarity = structural_similarity(a.astype(np.float64), b.astype(np.float64), data_range=1.0, full=True, **options)[1]
-    pad = window // 2
-    inner = (slice(pad, a.shape[0] - pad), slice(pad, a.shape[1] - pad))
-    chosen = similarity[inner][valid[inner]]
-    return float(chosen.mean()) if chosen.size else None
-
-
 def raw_ssim(measured: np.ndarray, predicted: np.ndarray, valid: np.ndarray, sensor: Sensor) -> list[float]:
     """SSIM of each mosaic sub-frame (or of each channel of a frame without mosaic)."""
     if sensor.mosaic is None:
-        pairs = [(measured[..., c], predicted[..., c], valid) for c in range(measured.shape[-1])]
-    else:
-        rows, columns = sensor.mosaic.shape
-        parts = [(slice(i, None, rows), slice(j, None, columns)) for i in range(rows) for j in range(columns)]
-        pairs = [(measured[p], predicted[p], valid[p]) for p in parts]
-    found = (ssim(*pair) for pair in pairs)
+        return ssim_of_channels(measured, predicted, valid)
+    rows, columns = sensor.mosaic.shape
+    parts = [(slice(i, None, rows), slice(j, None, columns)) for i in range(rows) for j in range(columns)]
+    found = (ssim(measured[part], predicted[part], valid[part]) for part in parts)
     return [value for value in found if value is not None]
-
-
-def spectral_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between spectra (..., C) in degrees, (...,); NaN where one is black.
-
-    2 atan2(|â - b̂|, |â + b̂|): exact for small angles, where arccos of a float32 dot product has lost everything.
-    """
-    a, b = a.astype(np.float64), b.astype(np.float64)
-    lengths = [np.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b)]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        a, b = (np.where(n > 0, x / n, np.nan) for x, n in zip((a, b), lengths, strict=True))
-    return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
 def _checked(truth: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.ndarray | None:
@@ -180,7 +138,7 @@ def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering
 
 
 def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
-    """What PSNR does not say: the spectrum's shape, the polarization state."""
+    """Errors that PSNR does not show: the shape of the spectrum, the polarization."""
     where = where & rendering.valid
     if sensor.is_polarization:
         ours, real = (torch.from_numpy(s[where].astype(np.float64)) for s in (rendering.stokes[sensor.name], truth))

@@ -1,4 +1,4 @@
-"""What the modalities see at the vertices of a mesh.
+"""Values of every modality at the vertices of a mesh.
 
 A *view* is one place of the rig: of each training view the frame of the first sensor that it has, with that frame's pose and lens. All
 modalities are asked along the same rays, so that a vertex has one spectrum and not five from five directions.

@@ -28,7 +28,7 @@ _PLY_NAMES = {"confidence": "quality"}
 _ROUNDING = 1e-3  # of an edge
 
 
-def check_suffix(path: Path) -> str:
+def check_suffix(path: Path | str) -> str:
     """The suffix in lower case.
 
     Raises:
@@ -40,7 +40,7 @@ def check_suffix(path: Path) -> str:
     return suffix
 
 
-def write_mesh(mesh: trimesh.Trimesh, path: Path, unit: str | None = None) -> None:
+def write_mesh(mesh: trimesh.Trimesh, path: Path | str, unit: str | None = None) -> None:
     """Write PLY, OBJ, STL or GLB, chosen by the suffix; whole or not at all.
 
     Args:

@@ -1,4 +1,4 @@
-"""What a mesh is, and how far it is from another.
+"""A mesh in figures, and its distance to another mesh.
 
 ``describe_mesh``: counts, components, watertight, Euler number, boundary edges, area, volume (of a watertight mesh only), bounds; with the
 field also the residual |f| at the vertices and the middles of faces, in the scene's unit.

@@ -1,4 +1,4 @@
-"""How the triangles of a mesh hang together: edges, components, closed or not. From vertex numbers alone, no distances."""
+"""Topology of a triangle mesh: edges, components, whether it is closed. From vertex indices alone, without distances."""
 
 from __future__ import annotations
 

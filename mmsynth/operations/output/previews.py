@@ -1,4 +1,4 @@
-"""Pictures for people. Nothing here is data: the only place where values are tone-mapped, clipped or coloured."""
+"""Previews to look at. This is the only place where values are tone-mapped, clipped or coloured; none of it is data."""
 
 from __future__ import annotations
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)``; the unit (rays, blocks, ...) is the operation's."""
+RaysDone = Callable[[int], None]
+"""What ``Field.render`` calls with the rays done since the last call; a ``Counter`` makes it of a ``Progress``."""
 
 
 class Counter:

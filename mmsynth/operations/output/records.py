@@ -14,21 +14,23 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import sha256_of
 from mmsynth.operations.output.previews import preview_linear
-from mmsynth.scene.images import read_exr, read_native, read_npz, write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.image_writers import write_exr, write_npz, write_tiff, write_tiff16
+from mmsynth.scene.images import read_exr, read_native, read_npz
 from mmsynth.scene.scene import Sensor
 from mmsynth.scene.serialisation import channels_to_json
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
-FORMATS = ("npz", "exr", "tiff")
+RecordFormat = Literal["npz", "exr", "tiff"]
+RECORD_FORMATS: tuple[RecordFormat, ...] = get_args(RecordFormat)
 UNITS = {"data": "full scale", "stokes": "full scale", "raw": "full scale", "flow": "px"}
 
 _PARTS = {
@@ -55,7 +57,13 @@ def modality_arrays(values: np.ndarray, stokes: np.ndarray | None) -> dict[str, 
 
 
 def write_record(
-    folder: Path, stem: str, arrays: Mapping[str, np.ndarray], format: str, units: Mapping[str, str], sensor: Sensor | None = None
+    folder: Path,
+    stem: str,
+    arrays: Mapping[str, np.ndarray],
+    file_format: RecordFormat,
+    *,
+    units: Mapping[str, str],
+    sensor: Sensor | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Write a record.
 
@@ -79,11 +87,11 @@ def write_record(
         return {"record": stem, "sha256": sha256_of(path), "bytes": path.stat().st_size, "arrays": described, **about}
 
     own = {key: str(array.dtype) for key, array in arrays.items()}
-    if format == "npz":
+    if file_format == "npz":
         path = folder / f"{stem}.npz"
         write_npz(path, {**arrays, **_labels_of(sensor)})
         return {path.name: entry(path, own)}
-    if format == "exr":
+    if file_format == "exr":
         path = folder / f"{stem}.exr"
         named = {key: _names(key, array, sensor) for key, array in arrays.items()}
         channels = {name: plane for key, array in arrays.items() for name, plane in zip(named[key], _planes(array), strict=True)}

@@ -12,7 +12,7 @@ from mmsynth.errors import InputError
 
 
 @dataclass(frozen=True)
-class Share:
+class WorkPartition:
     """One of ``processes``, counted from 0."""
 
     number: int = 0
@@ -25,7 +25,7 @@ class Share:
         return range(min(first, units), min(last, units))
 
 
-def share_of_environment() -> Share:
+def partition_of_environment() -> WorkPartition:
     """From RANK and WORLD_SIZE, all of it where they are not set.
 
     Raises:
@@ -34,7 +34,7 @@ def share_of_environment() -> Share:
     rank, size = os.environ.get("RANK", "0"), os.environ.get("WORLD_SIZE", "1")
     if not (rank.isdecimal() and size.isdecimal() and int(rank) < int(size)):
         raise InputError(f"environment: RANK is {rank!r} and WORLD_SIZE {size!r}, expected whole numbers, RANK below WORLD_SIZE.")
-    return Share(int(rank), int(size))
+    return WorkPartition(int(rank), int(size))
 
 
 def local_device(device: str) -> str:

@@ -24,16 +24,15 @@ comes from is all that coverage speaks of.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.operations.output.progress import Progress
-from mmsynth.operations.views.trajectories import View
 from mmsynth.operations.views.visibility import hidden, inside, towards
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import PosedCamera, Scene
 from mmsynth.sensors.camera import Camera, project, resized, surface_points, unproject
 
 if TYPE_CHECKING:
@@ -102,40 +101,40 @@ def training_rays(field: Field, scene: Scene, modalities: Sequence[str] | None =
     )
 
 
-def coverage(rays: TrainingRays, camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def coverage(rays: TrainingRays, view: PosedCamera, depth_ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Coverage of every pixel of a rendered view (definition: module docstring).
 
     Args:
-        camera_to_world: (4, 4), OpenCV axes. depth_ray: (H, W), scene unit. normal: (H, W, 3), world frame; both NaN = no surface.
+        depth_ray: (H, W), scene unit. normal: (H, W, 3), world frame; both NaN = no surface.
     Returns:
         (H, W) float32 in [0, 1], NaN = no surface.
     """
-    return _coverage(rays, camera, _focal(camera), camera_to_world, depth_ray, normal)
+    return _coverage(rays, view, _focal(view.camera), depth_ray, normal)
 
 
-def view_score(field: Field, rays: TrainingRays, camera: Camera, camera_to_world: np.ndarray) -> float:
+def view_score(field: Field, rays: TrainingRays, view: PosedCamera) -> float:
     """Mean coverage of what a view sees, in [0, 1], by a sparse grid of its rays; 0 for a view that sees no surface at all.
 
     The view is not rendered for it: 32 rays in a row, and as many rows as keep them square.
     """
-    sparse = resized(camera, min(SCORE_WIDTH, camera.width))
-    seen = field.render(sparse, camera_to_world, [], geometry=True)
-    covered = _coverage(rays, sparse, _focal(camera), camera_to_world, seen.depth_ray, seen.normal)
+    sparse = replace(view, camera=resized(view.camera, min(SCORE_WIDTH, view.camera.width)))
+    seen = field.render(sparse.camera, sparse.camera_to_world, [], geometry=True)
+    covered = _coverage(rays, sparse, _focal(view.camera), seen.depth_ray, seen.normal)
     hit = np.isfinite(covered)
     return float(covered[hit].mean(dtype=np.float64)) if hit.any() else 0.0
 
 
-def view_scores(field: Field, rays: TrainingRays, views: Sequence[View], progress: Progress | None = None) -> list[float]:
-    """``view_score`` of each of (camera, camera_to_world, name); progress is called with (views done, views in all)."""
+def view_scores(field: Field, rays: TrainingRays, views: Sequence[PosedCamera], progress: Progress | None = None) -> list[float]:
+    """``view_score`` of each view; progress is called with (views done, views in all)."""
     scores = []
-    for camera, pose, _ in views:
-        scores.append(view_score(field, rays, camera, pose))
+    for view in views:
+        scores.append(view_score(field, rays, view))
         if progress is not None:
             progress(len(scores), len(views))
     return scores
 
 
-def covered_views(views: Sequence[View], scores: Sequence[float], least: float) -> tuple[list[View], list[tuple[str, float]]]:
+def covered_views(views: Sequence[PosedCamera], scores: Sequence[float], least: float) -> tuple[list[PosedCamera], list[tuple[str, float]]]:
     """Views with a score of at least ``least``, and name and score of the others.
 
     Raises:
@@ -146,7 +145,7 @@ def covered_views(views: Sequence[View], scores: Sequence[float], least: float) 
         raise InputError(
             f"coverage: the best of {len(views)} views has {max(scores, default=0.0):.3f}, expected one with {least:g} or more."
         )
-    return kept, [(name, score) for (_, _, name), score in zip(views, scores, strict=True) if score < least]
+    return kept, [(view.name, score) for view, score in zip(views, scores, strict=True) if score < least]
 
 
 def _focal(camera: Camera) -> float:
@@ -162,13 +161,11 @@ def _cone(camera: Camera) -> float:
     return float(directions[:, 2].min()) - 1e-3 if valid.all() else -1.0  # the edge between the samples
 
 
-def _coverage(
-    rays: TrainingRays, camera: Camera, focal: float, camera_to_world: np.ndarray, depth_ray: np.ndarray, normal: np.ndarray
-) -> np.ndarray:
+def _coverage(rays: TrainingRays, view: PosedCamera, focal: float, depth_ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """``coverage`` of pixels that stand for a view with another focal length: of a sparse grid of its rays."""
     out = np.full(depth_ray.shape, np.nan, np.float32)
     hit = np.isfinite(depth_ray)
-    points, centre = surface_points(camera, camera_to_world, depth_ray)[hit], camera_to_world[:3, 3]
+    points, centre = surface_points(view.camera, view.camera_to_world, depth_ray)[hit], view.camera_to_world[:3, 3]
     normals = towards(normal[hit], points, centre)
     step = max(1, _PAIRS // len(rays.poses))
     parts = [slice(start, start + step) for start in range(0, len(points), step)]

@@ -5,22 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from mmsynth.operations.views.visibility import hidden, inside, towards
-from mmsynth.sensors.camera import Camera, project, surface_points
+from mmsynth.scene.scene import PosedCamera
+from mmsynth.sensors.camera import project, surface_points
 
 
 def optical_flow(
-    camera_a: Camera,
-    pose_a: np.ndarray,
-    depth_ray_a: np.ndarray,
-    normal_a: np.ndarray,
-    camera_b: Camera,
-    pose_b: np.ndarray,
-    depth_ray_b: np.ndarray,
+    a: PosedCamera, depth_ray_a: np.ndarray, normal_a: np.ndarray, b: PosedCamera, depth_ray_b: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where what the pixels of view a see lies in view b, through both lenses; of a scene that stands still.
 
     Args:
-        pose_a, pose_b: (4, 4) camera_to_world, OpenCV axes, one world frame and unit.
+        a, b: the two views, in one world frame and unit.
         depth_ray_a, depth_ray_b: (H, W) of each view, along the ray, in that unit; NaN = no surface.
         normal_a: (H, W, 3) world frame, unit; NaN = no surface. A surface that faces away from b is hidden from it: without normals the
             strip just behind an object's horizon, less than a pixel wide in b and many in a, would pass for seen.
@@ -30,12 +25,13 @@ def optical_flow(
         occluded, (H, W) bool: a sees a surface here, and b does not see that point, as it is out of b's frame or lens, or faces away, or
         something is nearer to b there, by more than ``visibility.SAME_SURFACE`` of the point's distance. False without a surface.
     """
-    points = surface_points(camera_a, pose_a, depth_ray_a)
+    points = surface_points(a.camera, a.camera_to_world, depth_ray_a)
     hit = np.isfinite(depth_ray_a)
-    in_b = (points[hit] - pose_b[:3, 3]) @ pose_b[:3, :3]
-    pixels = project(in_b, camera_b)
-    seen = inside(pixels, camera_b)
-    faces = np.einsum("ni,ni->n", towards(normal_a[hit], points[hit], pose_a[:3, 3]), pose_b[:3, 3] - points[hit]) > 0
+    centre_a, centre_b = a.camera_to_world[:3, 3], b.camera_to_world[:3, 3]
+    in_b = (points[hit] - centre_b) @ b.camera_to_world[:3, :3]
+    pixels = project(in_b, b.camera)
+    seen = inside(pixels, b.camera)
+    faces = np.einsum("ni,ni->n", towards(normal_a[hit], points[hit], centre_a), centre_b - points[hit]) > 0
     seen &= faces
     seen[seen] = ~hidden(np.linalg.norm(in_b[seen], axis=1), pixels[seen], depth_ray_b)
     flow = np.full((*hit.shape, 2), np.nan, np.float32)

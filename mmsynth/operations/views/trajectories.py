@@ -1,29 +1,21 @@
-"""Where to render from: poses files and generated camera paths.
+"""Generated camera paths.
 
-A view is ``(camera, camera_to_world, name)``: intrinsics with lens, (4, 4) float64 pose with OpenCV axes in the scene's world frame
-and unit, and a name. Generated paths turn around the region of interest and look at its centre (up is the training cameras' mean up), or
-follow the training poses.
+They turn around the region of interest and look at its centre (up is the training cameras' mean up), or follow the training
+poses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from mmsynth.errors import InputError
-from mmsynth.files import read_json
-from mmsynth.scene.poses import read_poses
-from mmsynth.scene.scene import Region, Scene
+from mmsynth.scene.checks import number, whole
+from mmsynth.scene.scene import PosedCamera, Region
 from mmsynth.sensors.camera import Camera
-
-if TYPE_CHECKING:
-    from mmsynth.field.field import Field
-
-View = tuple[Camera, np.ndarray, str]
 
 _KEYS: dict[str, dict[str, Any]] = {
     "orbit": {"views": 60, "elevation_deg": 25.0, "radius": None},
@@ -126,42 +118,27 @@ def _perturb(
 
 def _directions(kind: str, spec: Mapping[str, Any], where: str) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth [rad] and sine of the elevation of a path on a sphere, (V,) each."""
-    views = _whole(spec, "views", 1, 100_000, where)
+    views = whole(spec, "views", where, 1, 100_000)
     steps = np.arange(views)
     if kind == "orbit":
-        elevation = np.radians(_number(spec, "elevation_deg", -90.0, 90.0, where))
+        elevation = np.radians(number(spec, "elevation_deg", where, -90.0, 90.0))
         return 2 * np.pi * steps / views, np.full(views, np.sin(elevation))
-    lowest = _number(spec, "min_elevation_deg", -90.0, 90.0 if kind == "spiral" else 89.0, where)
+    lowest = number(spec, "min_elevation_deg", where, -90.0, 90.0 if kind == "spiral" else 89.0)
     if kind == "hemisphere":
         golden_angle = np.pi * (3.0 - np.sqrt(5.0))
         floor = np.sin(np.radians(lowest))
         return golden_angle * steps, floor + (1.0 - floor) * (steps + 0.5) / views
-    highest = _number(spec, "max_elevation_deg", -90.0, 90.0, where)
+    highest = number(spec, "max_elevation_deg", where, -90.0, 90.0)
     if lowest > highest:
         raise InputError(f"{where}: key 'max_elevation_deg' is {highest:g}, expected at least 'min_elevation_deg', {lowest:g}.")
     share = np.linspace(0.0, 1.0, views)
-    turns = _number(spec, "turns", -1000.0, 1000.0, where)
+    turns = number(spec, "turns", where, -1000.0, 1000.0)
     return 2 * np.pi * turns * share, np.sin(np.radians(lowest + (highest - lowest) * share))
-
-
-def _number(spec: Mapping[str, Any], key: str, low: float, high: float, where: str) -> float:
-    value = spec[key]
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value)
-    if not good or not low <= value <= high:
-        raise InputError(f"{where}: key '{key}' is {value!r}, expected a number from {low:g} to {high:g}.")
-    return float(value)
-
-
-def _whole(spec: Mapping[str, Any], key: str, low: int, high: int, where: str) -> int:
-    value = _number(spec, key, low, high, where)
-    if value != int(value):
-        raise InputError(f"{where}: key '{key}' is {value}, expected a whole number.")
-    return int(value)
 
 
 def trajectory_views(
     spec: Mapping[str, Any], region: Region, camera: Camera, training: Sequence[np.ndarray], where: str = "trajectory"
-) -> list[View]:
+) -> list[PosedCamera]:
     """A generated camera path.
 
     * ``{"trajectory": "orbit", "views": 60, "elevation_deg": 25, "radius": r}``: a circle, starting at the first training camera's side;
@@ -194,61 +171,13 @@ def trajectory_views(
         if len(training) < least:
             raise InputError(f"{where}: {len(training)} training poses, expected at least {least} to {kind}.")
     if kind == "interpolate":
-        poses = _interpolate(_whole(spec, "views", 1, 100_000, where), training, reach)
+        poses = _interpolate(whole(spec, "views", where, 1, 100_000), training, reach)
     elif kind == "perturb":
-        per_pose, seed = _whole(spec, "per_pose", 1, 10_000, where), _whole(spec, "seed", 0, 2**53, where)
-        rotation, translation = _number(spec, "rotation_deg", 0.0, 180.0, where), _number(spec, "translation", 0.0, 10.0, where)
+        per_pose, seed = whole(spec, "per_pose", where, 1, 10_000), whole(spec, "seed", where, 0, 2**53)
+        rotation, translation = number(spec, "rotation_deg", where, 0.0, 180.0), number(spec, "translation", where, 0.0, 10.0)
         poses = _perturb(per_pose, np.radians(rotation), translation, seed, region, training)
     else:
         azimuth, sine = _directions(kind, spec, where)
-        radius = reach if spec["radius"] is None else _number(spec, "radius", 1e-9, 1e9, where)
+        radius = reach if spec["radius"] is None else number(spec, "radius", where, 1e-9, 1e9)
         poses = _around(azimuth, sine, radius, region, training)
-    return [(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]
-
-
-def reference_camera(field: Field) -> Camera:
-    """Intrinsics of the field's first sensor that has any.
-
-    Raises:
-        InputError: the field stores no camera.
-    """
-    for name in field.sensors:
-        if name in field.cameras:
-            return field.cameras[name]
-    raise InputError("field: it stores no camera, expected poses with intrinsics.")
-
-
-def training_poses(field: Field, scene: Scene) -> list[np.ndarray]:
-    """(4, 4) poses of the reference sensor's training views, in view order, as the fit corrected them."""
-    for name in scene.sensors:
-        frames = scene.frames_of(name, scene.split.train)
-        if frames:
-            return [field.pose_of(frame) for frame in frames]
-    return []
-
-
-def load_views(path: Path | str, field: Field, scene: Scene | None = None, sensor: str | None = None) -> list[View]:
-    """Read a poses file or a trajectory (JSON with the key 'trajectory'); in the scene's world frame and unit.
-
-    Poses without intrinsics, and trajectories, take the camera of ``sensor``; None: the reference camera of the field.
-
-    Args:
-        scene: needed for a trajectory only: its training poses say what is up and how far away to be.
-    Raises:
-        InputError: unreadable file, unknown layout, or bad value.
-    """
-    path = Path(path)
-    own = None if sensor is None else field.cameras.get(sensor)
-    if path.suffix.lower() == ".json":
-        content = read_json(path)
-        if isinstance(content, dict) and "trajectory" in content:
-            training = training_poses(field, scene) if scene is not None else []
-            return trajectory_views(content, field.region, own or reference_camera(field), training, str(path))
-    poses = read_poses(path)
-    fallback = own or reference_camera(field) if any(camera is None for camera, _, _ in poses) else None
-    views: list[View] = []
-    for camera, pose, name in poses:
-        chosen = camera or fallback
-        assert chosen is not None
-        views.append((chosen, pose, name))
-    return views
+    return [PosedCamera(camera, pose, f"{index:04d}") for index, pose in enumerate(poses)]

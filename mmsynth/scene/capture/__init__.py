@@ -1,1 +1,1 @@
-"""From raw frames of calibration boards to what a scene needs to know of its cameras."""
+"""Calibration boards in raw frames: where their corners are."""

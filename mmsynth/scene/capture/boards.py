@@ -1,4 +1,4 @@
-"""Calibration boards in the pictures of a scene whose poses are known: things to look at usually stand on them or between them."""
+"""Calibration boards in a scene whose poses are known. Objects usually stand on or between them: they show the region of interest."""
 
 from __future__ import annotations
 

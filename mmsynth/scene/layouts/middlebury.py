@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.scene.checks import is_file, make_camera, rigid_pose, text_lines
 from mmsynth.scene.images import read_native
-from mmsynth.scene.layouts.mmsdata import make_sensor, wanted_modalities
-from mmsynth.scene.poses import make_camera, region_from_cameras, rigid, text_lines
+from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.region import region_from_cameras
 from mmsynth.scene.scene import Frame, Region, Scene, make_split
 
 
@@ -40,7 +41,7 @@ def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scen
     for view, (row, tokens) in enumerate(lines):
         where = f"{path}: line {row}"
         matrix, pose = _parse(tokens, where)
-        if (root / tokens[0]).is_file():
+        if is_file(root / tokens[0]):
             found.append((view, root / tokens[0], matrix, pose))
         else:
             missing += 1
@@ -74,7 +75,7 @@ def _parse(tokens: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
     matrix = matrix / matrix[2, 2]
     if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
         raise InputError(f"{where}: K has the skew {matrix[0, 1]:g}, expected 0: cameras with skew are not supported.")
-    world_to_camera = rigid(np.column_stack([values[9:18].reshape(3, 3), values[18:]]), where)
+    world_to_camera = rigid_pose(np.column_stack([values[9:18].reshape(3, 3), values[18:]]), where)
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = world_to_camera[:3, :3].T
     camera_to_world[:3, 3] = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]

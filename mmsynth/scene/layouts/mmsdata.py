@@ -26,25 +26,23 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
-from mmsynth.scene.images import read_native, saturation_level
-from mmsynth.scene.poses import OPENGL_TO_OPENCV, number, rigid, whole
-from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, canonical_modality, make_split
+from mmsynth.scene.checks import is_file, is_number, number, numbers, objects, rigid_pose, whole
+from mmsynth.scene.images import read_native
+from mmsynth.scene.known_sensors import KNOWN, make_sensor, wanted_modalities
+from mmsynth.scene.scene import (
+    MAX_VIEW,
+    OPENGL_TO_OPENCV,
+    Frame,
+    PosedCamera,
+    Region,
+    Scene,
+    Sensor,
+    Split,
+    StatedPose,
+    canonical_modality,
+    make_split,
+)
 from mmsynth.sensors.camera import Camera
-
-_MS_NM = (692.0, 653.0, 611.0, 572.0, 541.0, 503.0, 464.0, 431.0, None)
-
-# labels, wavelengths (None: broad), polarizer angles and raw pattern of the modalities of MMS-DATA
-_KNOWN: dict[str, dict[str, Any]] = {
-    "rgb": {"channels": ("R", "G", "B"), "pattern": [[1, 2], [0, 1]]},
-    "mono": {"channels": ("mono",), "pattern": [[0]]},
-    "nir": {"channels": ("nir",), "pattern": [[0]]},
-    "pol": {"channels": ("I0", "I45", "I90", "I135"), "angles": (0.0, 45.0, 90.0, 135.0), "pattern": [[2, 1], [3, 0]]},
-    "ms": {
-        "channels": tuple("pan" if nm is None else f"{nm:.0f}nm" for nm in _MS_NM),
-        "wavelengths": _MS_NM,
-        "pattern": [[4, 5, 6], [2, 1, 0], [3, 8, 7]],
-    },
-}
 
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE")
 _MODELS = (*_PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -98,11 +96,11 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
 
 
-def read_reference_poses(path: Path) -> list[tuple[Camera, np.ndarray, str]]:
+def read_reference_poses(path: Path) -> list[StatedPose]:
     """Poses of the reference sensor, the first modality of a ``meta_data.json``: by frame id, with or without image files.
 
     Returns:
-        (camera, camera_to_world (4, 4) in the frame and unit of ``read_mmsdata``, stem of the file name).
+        poses in the frame and unit of ``read_mmsdata``, named by the stems of their files.
     Raises:
         InputError: missing or wrong key, or a pose that is not finite and rigid.
     """
@@ -113,17 +111,17 @@ def read_reference_poses(path: Path) -> list[tuple[Camera, np.ndarray, str]]:
     camera = _camera(entry, where, _flag(meta, "undistorted", path), _pixel_offset(meta, path))
     to_output, scale, _ = _world_to_output(meta, path)
     frames = sorted(_stated_frames(entry, where, to_output, scale), key=lambda frame: frame[0])
-    return [(camera, pose, Path(file_name).stem) for _, file_name, pose in frames]
+    return [StatedPose(camera, pose, Path(file_name).stem) for _, file_name, pose in frames]
 
 
 def meta_content(
-    root: Path, sensors: Sequence[Sensor], frames: Mapping[str, Sequence[tuple[int, str, Camera, np.ndarray]]], region: Region, unit: str
+    root: Path, sensors: Sequence[Sensor], frames: Mapping[str, Mapping[int, PosedCamera]], region: Region, unit: str
 ) -> dict[str, Any]:
     """What ``meta_data.json`` says of a scene: the content of the file, that ``write_json`` takes.
 
     Args:
         root: to name in errors. region: becomes the scene box.
-        frames: by sensor, (view id, file name, camera, camera_to_world (4, 4) in the region's frame).
+        frames: by sensor and view id, named by their files; poses in the region's frame.
     Raises:
         InputError: what the format does not hold: a fisheye, k5 or k6, a sensor whose camera changes, frames with all channels
             at every pixel beside mosaics, of a modality that is known to have one.
@@ -133,7 +131,7 @@ def meta_content(
     raw = any(s.mosaic is not None for s in sensors)
     modalities = {}
     for sensor in sensors:
-        cameras = {camera for _, _, camera, _ in frames[sensor.name]}
+        cameras = {frame.camera for frame in frames[sensor.name].values()}
         if len(cameras) != 1:
             raise InputError(
                 f"{root}: {len(cameras)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames of a sensor."
@@ -143,7 +141,7 @@ def meta_content(
             raise InputError(
                 f"{root}: the lens of '{sensor.name}' does not fit MMS-DATA, which holds k1 k2 p1 p2 k3 k4 of Brown and Conrady."
             )
-        if raw and sensor.mosaic is None and sensor.channel_count > 1 and sensor.name in _KNOWN:
+        if raw and sensor.mosaic is None and sensor.channel_count > 1 and sensor.name in KNOWN:
             raise InputError(f"{root}: '{sensor.name}' has no mosaic, which MMS-DATA does not hold beside sensors that have one.")
         entry: dict[str, Any] = {
             "camera_model": "OPENCV",
@@ -157,10 +155,10 @@ def meta_content(
         if sensor.polarizer_angles_deg is not None:
             entry["polarizer_angles_deg"] = list(sensor.polarizer_angles_deg)
         entry["frames"] = []
-        for view, file_name, _, pose in frames[sensor.name]:
-            moved = pose.copy()
-            moved[:3, 3] = to_world[:3, :3] @ pose[:3, 3] + to_world[:3, 3]
-            entry["frames"].append({"frame_id": view, "file_name": file_name, "camtoworld": (moved @ OPENGL_TO_OPENCV)[:3].tolist()})
+        for view, frame in frames[sensor.name].items():
+            moved = frame.camera_to_world.copy()
+            moved[:3, 3] = to_world[:3, :3] @ moved[:3, 3] + to_world[:3, 3]
+            entry["frames"].append({"frame_id": view, "file_name": frame.name, "camtoworld": (moved @ OPENGL_TO_OPENCV)[:3].tolist()})
         modalities[sensor.name] = entry
     return {
         "undistorted": False, "raw": raw, "pixel_offset": 0.0,
@@ -169,83 +167,6 @@ def meta_content(
         "unit": unit,
         "modalities": modalities,
     }  # fmt: skip
-
-
-def wanted_modalities(known: Iterable[str], asked: Sequence[str] | None, path: Path) -> set[str]:
-    """Canonical names to read; an InputError lists the known ones if one asked for is not among them."""
-    names = list(known)
-    if asked is None:
-        return set(names)
-    for name in asked:
-        if canonical_modality(name) not in names:
-            raise InputError(f"{path}: no modality '{name}' in this scene, expected one of {', '.join(names)}.")
-    if not asked:
-        raise InputError(f"{path}: no modality asked for, expected at least one of {', '.join(names)}.")
-    return {canonical_modality(name) for name in asked}
-
-
-def make_sensor(name: str, entry: Mapping[str, Any], where: str, image: np.ndarray, raw: bool) -> Sensor:
-    """Describe a sensor by its entry in the file, what is known about its name, and its first image.
-
-    Args:
-        name: canonical modality name; an unknown one is a plain radiance modality.
-        entry: may hold ``mosaick_pattern``, ``channels``, ``wavelengths_nm``, ``polarizer_angles_deg``.
-        image: the first frame as stored, for the channel count of full-channel frames and the saturation level.
-        raw: frames are mosaicked. A pattern of one channel counts as no mosaic.
-    Raises:
-        InputError: pattern with holes or not a matrix, or lists whose length is not the channel count.
-    """
-    known = _KNOWN.get(name, {})
-    for key, types in (("channels", (str,)), ("wavelengths_nm", (int, float, type(None))), ("polarizer_angles_deg", (int, float))):
-        values = entry.get(key, [])
-        if not isinstance(values, list) or not all(isinstance(value, types) for value in values):
-            raise InputError(f"{where}: key '{key}' is {values!r}, expected a list with one entry per channel.")
-    given = entry.get("mosaick_pattern", known.get("pattern")) if raw else None
-    mosaic = None if given is None else _pattern(given, where)
-    if mosaic is not None:
-        count = int(mosaic.max()) + 1
-    else:
-        count = 1 if image.ndim == 2 else image.shape[2]
-        # grey + alpha and RGB + alpha: load_frame takes the alpha off
-        expected = len(entry.get("channels", known.get("channels", ())))
-        if (count == 2 and expected in (0, 1)) or (count == 4 and expected in (0, 1, 3)):
-            count = expected or count - 1
-    labels = entry.get("channels")
-    if labels is None:
-        labels = known["channels"] if len(known.get("channels", ())) == count else _plain_labels(name, count)
-    same = tuple(labels) == known.get("channels")
-    wavelengths = entry.get("wavelengths_nm") or (known.get("wavelengths") if same else None) or (None,) * count
-    angles = entry.get("polarizer_angles_deg") or (known.get("angles") if same else None)
-    if name == "pol" and angles is None:
-        raise InputError(f"{where}: {count} polarization channels, expected 4 or the key 'polarizer_angles_deg' with an angle for each.")
-    for key, values in (("channels", labels), ("wavelengths_nm", wavelengths), ("polarizer_angles_deg", angles)):
-        if values is not None and len(values) != count:
-            raise InputError(f"{where}: key '{key}' has {len(values)} entries, expected {count}, one per channel.")
-    return Sensor(
-        name=name,
-        channels=tuple(str(label) for label in labels),
-        wavelengths_nm=tuple(None if nm is None else float(nm) for nm in wavelengths),
-        mosaic=mosaic if count > 1 else None,
-        polarizer_angles_deg=None if angles is None else tuple(float(angle) for angle in angles),
-        saturation=saturation_level(image),
-    )
-
-
-def _plain_labels(name: str, count: int) -> tuple[str, ...]:
-    return (name,) if count == 1 else ("R", "G", "B") if count == 3 else tuple(str(index) for index in range(count))
-
-
-def _pattern(given: Any, where: str) -> np.ndarray:
-    try:
-        pattern = np.asarray(given)
-    except ValueError:
-        pattern = np.empty(0)
-    if pattern.ndim != 2 or pattern.size == 0 or pattern.dtype.kind not in "iu":
-        raise InputError(f"{where}: key 'mosaick_pattern' is {given}, expected a matrix of channel numbers.")
-    present = np.unique(pattern)
-    if not np.array_equal(present, np.arange(len(present))):
-        raise InputError(f"{where}: key 'mosaick_pattern' holds the channels {present.tolist()}, expected 0 to {len(present) - 1}.")
-    return pattern.astype(np.int64)
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -277,10 +198,7 @@ def _world_to_output(meta: Mapping[str, Any], path: Path) -> tuple[np.ndarray, f
     if meta.get("worldtogt") is None:
         return np.eye(4), 1.0, "input unit"
     where = f"{path}: key 'worldtogt'"
-    try:
-        matrix = np.asarray(meta["worldtogt"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where} is not a matrix of numbers, expected 4x4.") from error
+    matrix = numbers(meta["worldtogt"], f"{where} is not a matrix of numbers, expected 4x4.")
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{where} is not a finite 4x4 matrix, expected a similarity (rotation, one scale, translation).")
     scale = float(np.sqrt((matrix[:3, :3] ** 2).sum() / 3))  # of a similarity: every row has the length s
@@ -289,7 +207,7 @@ def _world_to_output(meta: Mapping[str, Any], path: Path) -> tuple[np.ndarray, f
     unscaled = matrix.copy()
     unscaled[:3, :3] /= scale
     try:
-        return rigid(unscaled, where), scale, "m"
+        return rigid_pose(unscaled, where), scale, "m"
     except InputError as error:
         raise InputError(f"{where} is not a similarity, expected a rotation, one scale and a translation.") from error
 
@@ -301,7 +219,7 @@ def _camera(entry: Mapping[str, Any], where: str, undistorted: bool, offset: flo
     distortion: tuple[float, ...] = ()
     if not undistorted and model not in _PINHOLE_MODELS:
         given = entry.get("distortion_params")
-        if not isinstance(given, list) or len(given) != 6 or not all(isinstance(value, (int, float)) for value in given):
+        if not isinstance(given, list) or len(given) != 6 or not all(is_number(value) for value in given):
             raise InputError(f"{where}: key 'distortion_params' is {given}, expected the six numbers k1 k2 p1 p2 k3 k4.")
         distortion = tuple(float(value) for value in given) if any(given) else ()
     try:
@@ -326,7 +244,7 @@ def _frames(
     missing = 0
     for view, file_name, pose in _stated_frames(entry, where, to_output, scale):
         path = root / "modalities" / source / file_name
-        if not path.is_file():
+        if not is_file(path):
             missing += 1
             continue
         mask = root / "masks" / source / f"{view:04d}.png"
@@ -337,24 +255,17 @@ def _frames(
 def _stated_frames(entry: Mapping[str, Any], where: str, to_output: np.ndarray, scale: float) -> Iterator[tuple[int, str, np.ndarray]]:
     """View id, file name and camera_to_world (4, 4) of what a modality lists, in its order; poses in the frame of the Scene."""
     seen: set[int] = set()
-    for index, item in enumerate(_frame_entries(entry, where)):
-        view = whole(item, "frame_id", f"{where}, frame entry {index}")
+    for index, item in enumerate(objects(entry, "frames", where)):
+        view = whole(item, "frame_id", f"{where}, frame entry {index}", 0, MAX_VIEW)
         here = f"{where}, frame {view}"
         if view in seen:
             raise InputError(f"{here} is listed twice, expected every frame_id once.")
         seen.add(view)
         if not isinstance(item.get("file_name"), str):
             raise InputError(f"{here}: key 'file_name' is {item.get('file_name', 'missing')!r}, expected the name of an image file.")
-        pose = rigid(item.get("camtoworld"), here) @ OPENGL_TO_OPENCV
+        pose = rigid_pose(item.get("camtoworld"), here) @ OPENGL_TO_OPENCV
         pose[:3, 3] *= scale  # then the rigid part: together s R x + t
         yield view, item["file_name"], to_output @ pose
-
-
-def _frame_entries(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
-    items = entry.get("frames")
-    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise InputError(f"{where}: key 'frames' is not a list of objects.")
-    return items
 
 
 def _split(root: Path, sources: Iterable[str], views: Iterable[int]) -> Split:

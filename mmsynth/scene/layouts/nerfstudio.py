@@ -1,12 +1,12 @@
-"""nerfstudio and instant-ngp scenes: ``transforms.json`` and image files.
+"""nerfstudio and instant-ngp: scenes (``transforms.json`` and image files), poses of ``transforms.json`` and ``camera_path.json``.
 
 * ``transform_matrix`` is camera-to-world in OpenGL axes; principal points have the top-left pixel's centre at 0.5.
 * The id of a view is the frame's ``view`` key, else its position in the list (frames without an image count too, so ids
   do not depend on what was downloaded).
 * Test views: ``test_filenames`` (or all but ``train_filenames``), else ``test_ids``, else every tenth.
 * One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
-  says which, and the optional top-level object ``modalities`` describes them with the keys of ``mmsdata.make_sensor``.
-* The region of interest is not in the file: see ``poses.region_from_cameras``, and ``region_from_points`` for files with the sparse
+  says which, and the optional top-level object ``modalities`` describes them with the keys of ``known_sensors.make_sensor``.
+* The region of interest is not in the file: see ``region.region_from_cameras``, and ``region_from_points`` for files with the sparse
   points of ``ply_file_path`` and for pictures with calibration boards.
 """
 
@@ -22,10 +22,28 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.capture.boards import board_points
+from mmsynth.scene.checks import is_file, make_camera, number, numbers, objects, rigid_pose, whole
 from mmsynth.scene.images import SUFFIXES, read_native
-from mmsynth.scene.layouts.mmsdata import make_sensor, wanted_modalities
-from mmsynth.scene.poses import OPENGL_TO_OPENCV, entries, region_from_cameras, region_from_points, rigid, transforms_camera, whole
-from mmsynth.scene.scene import Frame, Scene, Sensor, Split, canonical_modality, make_split
+from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.region import region_from_cameras, region_from_points
+from mmsynth.scene.scene import (
+    MAX_VIEW,
+    OPENGL_TO_OPENCV,
+    Frame,
+    PosedCamera,
+    Region,
+    Scene,
+    Sensor,
+    Split,
+    StatedPose,
+    canonical_modality,
+    make_split,
+)
+from mmsynth.sensors.camera import COEFFICIENTS, Camera, Lens
+
+_BROWN_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE_MODEL = "OPENCV_FISHEYE"
+_MODEL_OF: dict[str, str] = {"brown_conrady": "OPENCV", "kannala_brandt": _FISHEYE_MODEL}
 
 
 def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scene:
@@ -43,23 +61,13 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
     meta = read_json(path)
     if not isinstance(meta, dict):
         raise InputError(f"{path}: a JSON {type(meta).__name__}, expected an object with the key 'frames'.")
-    listed = entries(meta, "frames", path)
-    images = [_image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)]
-    present = [index for index, image in enumerate(images) if image is not None]
-    if not present:
-        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
-    problems = []
-    if len(present) < len(listed):
-        problems.append(f"{len(listed) - len(present)} of {len(listed)} frames have no image file and are left out.")
-    for source in dict.fromkeys(str(frame.get("modality", "")) for frame in listed):
-        if not any(str(listed[index].get("modality", "")) == source for index in present):
-            problems.append(f"{source or 'the default modality'}: none of its frames has an image file, it is left out.")
-
+    listed = objects(meta, "frames", path)
+    images = _images(root, listed, path)
+    problems = _missing(listed, images)
     first: dict[str, np.ndarray] = {}  # by modality as the file spells it: the first image, for size and channels
-    for index in present:
-        source = str(listed[index].get("modality", ""))
-        if source not in first:
-            first[source] = read_native(_known(images[index]))
+    for index, file in images.items():
+        if _source(listed[index]) not in first:
+            first[_source(listed[index])] = read_native(file)
     names = {source: canonical_modality(source) if source else _default_modality(image) for source, image in first.items()}
     wanted = wanted_modalities(dict.fromkeys(names.values()), modalities, path)
     described = _described(meta, path)
@@ -68,42 +76,86 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
         if names[source] in wanted and names[source] not in sensors:
             entry = described.get(names[source], {})
             sensors[names[source]] = make_sensor(names[source], entry, str(path), image, raw="mosaick_pattern" in entry)
+    sizes = {source: (image.shape[1], image.shape[0]) for source, image in first.items() if names[source] in sensors}
+    frames = _frames(meta, listed, images, names, sizes, path)
+    alpha = any(_has_alpha(first[source], sensors[names[source]]) for source in sizes)
+    region = _region(meta, root, sensors, frames, problems)
+    split = _split(meta, frames, path)
+    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
 
+
+def _source(frame: Mapping[str, Any]) -> str:
+    """Its modality as the file spells it; empty where it does not say."""
+    return str(frame.get("modality", ""))
+
+
+def _images(root: Path, listed: Sequence[Mapping[str, Any]], path: Path) -> dict[int, Path]:
+    """The image of each frame that has one, by the frame's position in the list."""
+    found = {index: _image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)}
+    images = {index: image for index, image in found.items() if image is not None}
+    if not images:
+        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
+    return images
+
+
+def _missing(listed: Sequence[Mapping[str, Any]], images: Mapping[int, Path]) -> list[str]:
+    """A sentence about frames, and one about each modality, without images."""
+    problems = []
+    if len(images) < len(listed):
+        problems.append(f"{len(listed) - len(images)} of {len(listed)} frames have no image file and are left out.")
+    there = {_source(listed[index]) for index in images}
+    for source in dict.fromkeys(map(_source, listed)):
+        if source not in there:
+            problems.append(f"{source or 'the default modality'}: none of its frames has an image file, it is left out.")
+    return problems
+
+
+def _frames(
+    meta: Mapping[str, Any],
+    listed: Sequence[Mapping[str, Any]],
+    images: Mapping[int, Path],
+    names: Mapping[str, str],
+    sizes: Mapping[str, tuple[int, int]],
+    path: Path,
+) -> list[Frame]:
+    """Frames with an image, of the modalities whose sizes are given, by sensor and view; every pose in the list is checked."""
     frames: list[Frame] = []
     positions: dict[str, int] = {}
-    for index, (frame, found) in enumerate(zip(listed, images, strict=True)):
-        source = str(frame.get("modality", ""))
+    for index, frame in enumerate(listed):
+        source = _source(frame)
         where = f"{path}: frame {index} ({frame['file_path']})"
         position = positions.get(source, 0)
         positions[source] = position + 1
-        pose = rigid(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
-        if found is None or names[source] not in wanted:
+        pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
+        if index not in images or source not in sizes:
             continue
-        camera = transforms_camera(meta, frame, where, (first[source].shape[1], first[source].shape[0]))
+        camera = _camera(meta, frame, where, sizes[source])
         if camera is None:
             raise InputError(f"{where}: no focal length, expected 'fl_x' or 'camera_angle_x' in the frame or the file.")
-        view = whole(frame, "view", where) if "view" in frame else position
-        mask = root / str(frame["mask_path"]) if "mask_path" in frame else None
-        frames.append(Frame(names[source], view, found, camera, pose, source, mask if mask is not None and mask.is_file() else None))
-    order = list(sensors)
+        view = whole(frame, "view", where, 0, MAX_VIEW) if "view" in frame else position
+        mask = path.parent / str(frame["mask_path"]) if "mask_path" in frame else None
+        mask = mask if mask is not None and is_file(mask) else None
+        frames.append(Frame(names[source], view, images[index], camera, pose, source, mask))
+    order = list(dict.fromkeys(names[source] for source in sizes))
     frames.sort(key=lambda frame: (order.index(frame.sensor), frame.view))
     for one, two in itertools.pairwise(frames):
         if (one.sensor, one.view) == (two.sensor, two.view):
             raise InputError(f"{path}: view {one.view} of '{one.sensor}' is listed twice, expected every view once.")
-    alpha = any(_has_alpha(image, sensors[names[source]]) for source, image in first.items() if names[source] in sensors)
+    return frames
+
+
+def _region(meta: Mapping[str, Any], root: Path, sensors: Mapping[str, Sensor], frames: Sequence[Frame], problems: list[str]) -> Region:
+    """That of the cameras; smaller where the file's sparse points, or calibration boards in the pictures, say so."""
     region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
     stands = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
     if "ply_file_path" in meta:
         points = _sparse_points(root / str(meta["ply_file_path"]))
-        if points is None:
-            problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
-        else:
-            region = region_from_points(points, region, stands)
-    else:
-        plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
-        region = region_from_points(board_points(plain), region, stands) if plain else region
-    split = _split(meta, frames, path)
-    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
+        if points is not None:
+            return region_from_points(points, region, stands)
+        problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
+        return region
+    plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
+    return region_from_points(board_points(plain), region, stands) if plain else region
 
 
 def _sparse_points(path: Path) -> np.ndarray | None:
@@ -125,12 +177,7 @@ def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None
     path = root / frame["file_path"]
     # appended, not replaced: "0001.rgb" is a name without extension
     candidates = [path] if path.suffix.lower() in SUFFIXES else [path.with_name(path.name + suffix) for suffix in SUFFIXES]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
-
-
-def _known(path: Path | None) -> Path:
-    assert path is not None
-    return path
+    return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
 def _default_modality(image: np.ndarray) -> str:
@@ -171,3 +218,111 @@ def _names(meta: Mapping[str, Any], key: str, path: Path) -> set[str]:
 
 def _without_suffix(path: Path) -> Path:
     return path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
+
+
+def read_transforms(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
+    """The poses of ``transforms.json``, whose content is given; intrinsics where it has them."""
+    out: list[StatedPose] = []
+    for index, frame in enumerate(objects(content, "frames", path)):
+        where = f"{path}: frame {index}"
+        name = str(frame.get("file_path", f"{index:04d}"))
+        image = path.parent / name
+        size = None
+        if not {"w", "h"} <= {**content, **frame}.keys() and is_file(image):
+            height, width = read_native(image).shape[:2]
+            size = width, height
+        pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
+        out.append(StatedPose(_camera(content, frame, where, size), pose, Path(name).stem))
+    return out
+
+
+def read_camera_path(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
+    """The poses of ``camera_path.json``, whose content is given; square pixels, no distortion."""
+    kind = content.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise InputError(f"{path}: camera_type '{kind}' is not supported yet, expected 'perspective'.")
+    out: list[StatedPose] = []
+    for index, entry in enumerate(objects(content, "camera_path", path)):
+        where = f"{path}: camera {index}"
+        complaint = f"{where}: key 'camera_to_world' does not hold 16 numbers."
+        matrix = numbers(entry.get("camera_to_world"), complaint)
+        if matrix.size != 16:
+            raise InputError(complaint)
+        camera = None
+        if "render_width" in content and "render_height" in content and "fov" in entry:
+            width, height = whole(content, "render_width", str(path)), whole(content, "render_height", str(path))
+            fov = number(entry, "fov", where)
+            if not 0 < fov < 180:
+                raise InputError(f"{where}: key 'fov' is {fov}, expected between 0 and 180 degrees.")
+            focal = float(height / 2 / np.tan(np.radians(fov) / 2))
+            camera = make_camera(where, width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5, ())
+        out.append(StatedPose(camera, rigid_pose(matrix.reshape(4, 4), where) @ OPENGL_TO_OPENCV, f"{index:04d}"))
+    return out
+
+
+def _camera(shared: Mapping[str, Any], frame: Mapping[str, Any], where: str, size: tuple[int, int] | None = None) -> Camera | None:
+    """Intrinsics of one frame of transforms.json; a key of the frame wins over the shared one.
+
+    Distortion k1..k6, p1, p2 is read as OpenCV's rational Brown model, k1..k4 of an ``OPENCV_FISHEYE`` (or ``is_fisheye``) as
+    Kannala-Brandt's. Keys that are missing: coefficients = 0, cx, cy = image centre, fl_y = fl_x, and fl_x, fl_y from
+    camera_angle_x, camera_angle_y [rad].
+
+    Args:
+        size: width, height of the image for files without w and h.
+    Returns:
+        None when there is neither a focal length nor an angle, or no size.
+    Raises:
+        InputError: bad number, or another lens model.
+    """
+    merged = {**shared, **frame}
+    model = str(merged.get("camera_model", "OPENCV")).upper()
+    fisheye = model == _FISHEYE_MODEL or (model in _BROWN_MODELS and bool(merged.get("is_fisheye")))
+    if model not in _BROWN_MODELS and not fisheye:
+        raise InputError(f"{where}: camera_model {model} is not supported, expected one of {' '.join((*_BROWN_MODELS, _FISHEYE_MODEL))}.")
+    if "w" in merged and "h" in merged:
+        size = whole(merged, "w", where), whole(merged, "h", where)
+    if size is None:
+        return None
+    width, height = size
+    # the innermost place that says anything about the focal length decides
+    source = frame if any(key in frame for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")) else shared
+    fx, fy = _focal(source, "x", width, where), _focal(source, "y", height, where)
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None:
+        return None
+    cx = number(merged, "cx", where) if "cx" in merged else width / 2
+    cy = number(merged, "cy", where) if "cy" in merged else height / 2
+    lens: Lens = "kannala_brandt" if fisheye else "brown_conrady"
+    distortion = [number(merged, key, where) if key in merged else 0.0 for key in COEFFICIENTS[lens]]
+    return make_camera(where, width, height, fx, fy, cx - 0.5, cy - 0.5, distortion, lens)
+
+
+def _focal(entry: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:
+    if f"fl_{axis}" in entry:
+        return number(entry, f"fl_{axis}", where)
+    if f"camera_angle_{axis}" in entry:
+        angle = number(entry, f"camera_angle_{axis}", where)
+        if not 0 < angle < np.pi:
+            raise InputError(f"{where}: key 'camera_angle_{axis}' is {angle}, expected an angle between 0 and pi radians.")
+        return float(pixels / 2 / np.tan(angle / 2))
+    return None
+
+
+def transforms_content(views: Sequence[PosedCamera]) -> dict[str, Any]:
+    """What ``transforms.json`` says of pictures, whose ``file_path`` are the cameras' names: for ``write_json``."""
+    frames = [
+        {
+            "camera_model": _MODEL_OF[view.camera.lens],
+            "file_path": view.name,
+            "w": view.camera.width,
+            "h": view.camera.height,
+            "fl_x": view.camera.fx,
+            "fl_y": view.camera.fy,
+            "cx": view.camera.cx + 0.5,
+            "cy": view.camera.cy + 0.5,
+            **dict(zip(COEFFICIENTS[view.camera.lens], map(float, view.camera.coefficients), strict=True)),
+            "transform_matrix": (np.asarray(view.camera_to_world) @ OPENGL_TO_OPENCV).tolist(),
+        }
+        for view in views
+    ]
+    return {"camera_model": frames[0]["camera_model"] if frames else "OPENCV", "frames": frames}

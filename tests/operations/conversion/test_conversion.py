@@ -13,10 +13,10 @@ from analytic import MONO, MS, POL, RGB, AnalyticField, ring_pose, scene_of, sph
 
 import mmsynth
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion.files import convert_frames
+from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.guidance import guide, linear_map
 from mmsynth.operations.conversion.methods import Converted, chosen_method, convert_frame
-from mmsynth.scene.scene import Sensor
+from mmsynth.scene.scene import PosedCamera, Sensor
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.mosaic import mosaic
 from mmsynth.sensors.polarization import angle_of_linear_polarization, degree_of_linear_polarization
@@ -57,7 +57,8 @@ def frame(source: Sensor, noise: float = 0.0, camera: Camera = CAMERA, pose: np.
 
 
 def converted(source: Sensor, target: str, method: str = "auto", field: Any = None, **how: Any) -> Converted:
-    return convert_frame(field or WrongField(sphere()), how.pop("raw", frame(source)), CAMERA, POSE, source.name, target, method, **how)
+    raw, names = how.pop("raw", frame(source)), {"source": source.name, "target": target}
+    return convert_frame(field or WrongField(sphere()), raw, PosedCamera(CAMERA, POSE), method=method, **names, **how)  # type: ignore[arg-type]
 
 
 def error(a: np.ndarray, b: np.ndarray) -> float:
@@ -152,8 +153,9 @@ def test_as_the_target_sensor_would_have_seen_it() -> None:
     beside = POSE.copy()
     beside[:3, 3] += 0.15 * POSE[:3, 0]
     field: Any = Painted(sphere())
-    kept = convert_frame(field, frame(MONO), CAMERA, POSE, "mono", "ms", "field", (CAMERA, beside))
-    found = convert_frame(field, frame(MONO), CAMERA, POSE, "mono", "ms", "ratio", (CAMERA, beside))
+    to_ms: Any = {"source": "mono", "target": "ms"}
+    kept = convert_frame(field, frame(MONO), PosedCamera(CAMERA, POSE), method="field", seen_by=PosedCamera(CAMERA, beside), **to_ms)
+    found = convert_frame(field, frame(MONO), PosedCamera(CAMERA, POSE), method="ratio", seen_by=PosedCamera(CAMERA, beside), **to_ms)
     lit = found.opacity > 0.5
     expected = truth("ms", CAMERA, beside)
     told = lit & found.guided
@@ -161,7 +163,9 @@ def test_as_the_target_sensor_would_have_seen_it() -> None:
     assert told.sum() > 0.8 * lit.sum() and rms(found) < rms(kept) / 1.8  # six tenths of it are taken
     np.testing.assert_array_equal(found.values[~found.guided], kept.values[~found.guided])
     # the ball hides its own far side: from behind nothing of the frame is seen
-    behind = convert_frame(field, frame(MONO), CAMERA, POSE, "mono", "ms", "ratio", (CAMERA, ring_pose(2, 4)))
+    behind = convert_frame(
+        field, frame(MONO), PosedCamera(CAMERA, POSE), method="ratio", seen_by=PosedCamera(CAMERA, ring_pose(2, 4)), **to_ms
+    )
     assert behind.guided[behind.opacity > 0.5].mean() < 0.05
 
 
@@ -192,7 +196,7 @@ def test_the_gain_is_the_weighted_mean_that_it_should_be() -> None:
     half[:, 25:] = 0.6
     found = guide(half, rendered, MONO, np.ones((30, 40), bool))
     assert found.exposure == pytest.approx(1.0) and found.gain[10, 35] == pytest.approx(1.2, abs=0.01)
-    assert found.gain[10, 5] == pytest.approx(1.0, abs=0.01) and not found.strange.any()
+    assert found.gain[10, 5] == pytest.approx(1.0, abs=0.01) and not found.unexplained.any()
 
 
 def test_methods_by_name() -> None:
@@ -208,7 +212,7 @@ def test_methods_by_name() -> None:
 def test_files_of_a_target_at_its_own_place(tmp_path: Path) -> None:
     field: Any = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
-    convert_frames(field, scene, "rgb", "ms", tmp_path / "out", [1], as_sensor=True)
+    convert_files(field, scene, tmp_path / "out", source="rgb", target="ms", frames=[1], as_sensor=True)
     sidecar = json.loads((tmp_path / "out/ms/0001.json").read_text())
     np.testing.assert_allclose(sidecar["camera"]["camera_to_world"], scene.frames_of("ms")[1].camera_to_world, atol=1e-12)
     assert sidecar["method"] == "guided" and 0 < sidecar["guided"] <= 1
@@ -229,7 +233,7 @@ def test_tensors_in_batches() -> None:
     assert found.values.shape == (2, 4, 72, 96) and found.stokes is not None and found.stokes.shape == (2, 3, 72, 96)
     assert found.confidence.shape == found.guided.shape == found.valid.shape == (2, 1, 72, 96) and found.method == "ratio"
     for i in range(2):
-        one = convert_frame(field, raw[i], CAMERA, poses[i], "rgb", "pol")
+        one = convert_frame(field, raw[i], PosedCamera(CAMERA, poses[i]), source="rgb", target="pol")
         np.testing.assert_array_equal(found.stokes[i].numpy(), np.moveaxis(one.stokes, -1, 0))  # type: ignore[arg-type]
         assert float(found.exposure[i]) == pytest.approx(one.exposure, rel=1e-6)
     colours = torch.from_numpy(np.moveaxis(frame(MONO), -1, 0))[None]

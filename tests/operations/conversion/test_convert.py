@@ -13,10 +13,12 @@ import torch
 from analytic import RGB, AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion.files import convert_at_poses, convert_frames
+from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.output.records import read_record
 from mmsynth.operations.views.coverage import coverage, training_rays
-from mmsynth.scene.images import read_image, write_png16
+from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.images import read_image
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.mosaic import mosaic
 from mmsynth.sensors.polarization import stokes_to_intensities
 
@@ -25,7 +27,9 @@ def test_convert_to_multispectral(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=3, truth=False)
     calls: list[tuple[int, int]] = []
-    written = convert_frames(field, scene, "rgb", "multispectral", tmp_path / "out", method="field", progress=lambda *c: calls.append(c))  # type: ignore[arg-type]
+    written = convert_files(
+        field, scene, tmp_path / "out", source="rgb", target="multispectral", method="field", progress=lambda *c: calls.append(c)
+    )  # type: ignore[arg-type]
     assert sorted(p.name for p in written) == [f"{v:04d}{s}" for v in range(3) for s in (".json", ".npz", ".png", "_confidence.png")]
     assert all(p.parent == tmp_path / "out" / "ms" and p.is_file() for p in written)
     frame = scene.frames_of("rgb")[1]
@@ -47,7 +51,7 @@ def test_convert_to_multispectral(tmp_path: Path) -> None:
 def test_convert_to_polarization(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
-    written = convert_frames(field, scene, "multispectral", "pol", tmp_path / "out", views=[1])  # type: ignore[arg-type]
+    written = convert_files(field, scene, tmp_path / "out", source="multispectral", target="pol", frames=[1])  # type: ignore[arg-type]
     assert sorted(p.name for p in written) == ["0001.json", "0001.npz", "0001.png", "0001_aolp.png", "0001_confidence.png", "0001_dolp.png"]
     with np.load(tmp_path / "out/pol/0001.npz") as arrays:
         assert np.allclose(stokes_to_intensities(torch.from_numpy(arrays["stokes"]), (0, 45, 90, 135)), arrays["data"], atol=1e-6)
@@ -58,8 +62,8 @@ def test_convert_to_polarization(tmp_path: Path) -> None:
 def test_rerun_gives_the_same_bytes(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=1, truth=False)
-    first = {p: p.read_bytes() for p in convert_frames(field, scene, "rgb", "pol", tmp_path / "out")}  # type: ignore[arg-type]
-    again = {p: p.read_bytes() for p in convert_frames(field, scene, "rgb", "pol", tmp_path / "out")}  # type: ignore[arg-type]
+    first = {p: p.read_bytes() for p in convert_files(field, scene, tmp_path / "out", source="rgb", target="pol")}  # type: ignore[arg-type]
+    again = {p: p.read_bytes() for p in convert_files(field, scene, tmp_path / "out", source="rgb", target="pol")}  # type: ignore[arg-type]
     assert first == again
 
 
@@ -76,31 +80,32 @@ def test_refuses(tmp_path: Path, source: str, target: str, views: list[int] | No
     field = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
     with pytest.raises(InputError, match=message):
-        convert_frames(field, scene, source, target, tmp_path / "out", views)  # type: ignore[arg-type]
+        convert_files(field, scene, tmp_path / "out", source=source, target=target, frames=views)  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("format", ["npz", "exr", "tiff"])
-def test_at_given_poses(tmp_path: Path, format: str) -> None:
+@pytest.mark.parametrize("file_format", ["npz", "exr", "tiff"])
+def test_at_given_poses(tmp_path: Path, file_format: Any) -> None:
     """The field alone where there is no frame; the frame has its say where there is one, found by its name."""
     field: Any = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=3, truth=False)
     camera = field.cameras["rgb"]
-    views = [(camera, ring_pose(i, 9), f"images/shot{i}.jpg") for i in range(3)]
+    views = [PosedCamera(camera, ring_pose(i, 9), f"images/shot{i}.jpg") for i in range(3)]
     rays = training_rays(field, scene)
-    convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "plain", format=format)
+    convert_files(field, scene, tmp_path / "plain", source="rgb", target="ms", views=views, file_format=file_format)
     for i in range(3):
         facts = json.loads((tmp_path / f"plain/ms/shot{i}.json").read_text())
         assert facts["method"] == "field" and facts["frame"] is None and facts["guided"] == 0
         back = read_record(tmp_path / "plain/ms", facts["files"], f"shot{i}")
         seen = field.render(camera, ring_pose(i, 9), [])
-        covered = coverage(rays, camera, ring_pose(i, 9), seen.depth_ray, seen.normal)
+        covered = coverage(rays, PosedCamera(camera, ring_pose(i, 9)), seen.depth_ray, seen.normal)
         np.testing.assert_allclose(back["confidence"], np.where(np.isnan(covered), 0.0, covered), atol=1e-6)
         assert (np.nanmean(covered) > 0.94) == (i == 0)  # a training pose
         np.testing.assert_allclose(back["data"], field.render(camera, ring_pose(i, 9), ["ms"]).channels["ms"], atol=1 / 65535)
     raw = mosaic(torch.from_numpy(field.render(camera, ring_pose(1, 9), ["rgb"]).channels["rgb"]).movedim(-1, 0), RGB.mosaic)  # type: ignore[arg-type]
     write_png16(tmp_path / "shot1.png", 0.5 * raw.numpy())
-    convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "seen", [tmp_path / "shot1.png"], as_sensor=True, format=format)
+    to_ms: Any = {"source": "rgb", "target": "ms", "views": views, "file_format": file_format}
+    convert_files(field, scene, tmp_path / "seen", images=[tmp_path / "shot1.png"], as_sensor=True, **to_ms)
     assert [p.stem for p in (tmp_path / "seen/ms").glob("*.json")] == ["shot1"]
     facts = json.loads((tmp_path / "seen/ms/shot1.json").read_text())
     assert facts["method"] == "guided" and facts["frame_exposure"] == pytest.approx(0.5, rel=1e-3)
@@ -110,17 +115,18 @@ def test_at_given_poses(tmp_path: Path, format: str) -> None:
 def test_refuses_poses_that_do_not_fit(tmp_path: Path) -> None:
     field: Any = AnalyticField(sphere())
     scene = scene_of(field, tmp_path / "scene", views=2, truth=False)
-    views = [(field.cameras["rgb"], ring_pose(0, 9), "0000")]
+    views = [PosedCamera(field.cameras["rgb"], ring_pose(0, 9), "0000")]
+    to_ms: Any = {"source": "rgb", "target": "ms", "views": views}
     for arguments, message in [
         ({"method": "ratio"}, "method 'ratio' needs frames of rgb"),
         ({"images": [tmp_path / "0001.png"]}, r"0001\.png: no pose has this name, expected one of 0000"),
-        ({"format": "jpg"}, "format is 'jpg', expected one of npz, exr, tiff"),
+        ({"file_format": "jpg"}, "format is 'jpg', expected one of npz, exr, tiff"),
         ({"method": "magic", "images": [tmp_path / "0000.png"]}, "method is 'magic'"),
         ({"images": [tmp_path / "0000.png", tmp_path / "a" / "0000.png"]}, "two images have one name"),
     ]:
         with pytest.raises(InputError, match=message):
-            convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "out", **arguments)  # type: ignore[arg-type]
+            convert_files(field, scene, tmp_path / "out", **to_ms, **arguments)
     del field.rig["ms"]
     with pytest.raises(InputError, match="'ms' has no known place on the rig of 'rgb'"):
-        convert_at_poses(field, scene, "rgb", "ms", views, tmp_path / "out", as_sensor=True)
+        convert_files(field, scene, tmp_path / "out", **to_ms, as_sensor=True)
     assert not (tmp_path / "out").exists()

@@ -16,10 +16,10 @@ from scipy.ndimage import map_coordinates
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.fitting.motions import motion_of, rigid
-from mmsynth.operations.conversion.files import convert_images
+from mmsynth.fitting.motions import matrix_to_motion, motion_to_matrix
+from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.register import Landmarks, landmarks, register
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Split
 from mmsynth.sensors.camera import Camera, project, ray_map
 from mmsynth.sensors.mosaic import mosaic
@@ -62,12 +62,12 @@ def test_a_frame_is_found_to_a_fraction_of_a_pixel(field: Field, scene: Scene) -
     random = np.random.default_rng(0)
     known = landmarks(field, scene, "rgb")
     for exposure in (1.0, 0.5):
-        pose = ring_pose(1, 24) @ rigid(np.r_[random.normal(0, 0.05, 3), 0.02, -0.03, 0.25][None])[0]
+        pose = ring_pose(1, 24) @ motion_to_matrix(np.r_[random.normal(0, 0.05, 3), 0.02, -0.03, 0.25][None])[0]
         found = register(field, known, (exposure * _raw(field, pose, 99)).astype(np.float32), CAMERA, "rgb")
         points = 0.7 * np.array([[0.0, 0.0, 0.0], *np.eye(3), *-np.eye(3)])
         shown = [project((points - p[:3, 3]) @ p[:3, :3], CAMERA) for p in (pose, found.pose)]
         assert np.nanmax(np.linalg.norm(shown[0] - shown[1], axis=1)) < 0.2
-        off = motion_of((np.linalg.inv(pose) @ found.pose)[None])[0]
+        off = matrix_to_motion((np.linalg.inv(pose) @ found.pose)[None])[0]
         assert (np.abs(off) < 6 * np.sqrt(np.diag(found.covariance)) + 1e-5).all()
         assert found.sd_px < 0.1 and found.inliers > 50 and found.exposure == pytest.approx(exposure, rel=0.03)
 
@@ -104,7 +104,7 @@ def test_markers_tell_squares_that_look_alike_apart(tmp_path: Path) -> None:
         field, Scene(tmp_path, "test", field.sensors, tuple(frames), field.region, Split(tuple(range(6)), (), ""), "m"), "mono"
     )
     assert len(known.markers) > 40
-    pose = at(2.5) @ rigid(np.array([[0.02, -0.03, 0.4, 0.05, 0.0, 0.1]]))[0]
+    pose = at(2.5) @ motion_to_matrix(np.array([[0.02, -0.03, 0.4, 0.05, 0.0, 0.1]]))[0]
     found = register(field, Landmarks([], known.markers), shot(pose), camera, "mono")
     np.testing.assert_allclose(found.pose, pose, atol=2e-3)
     assert found.inliers > 40
@@ -124,14 +124,14 @@ def test_a_frame_of_something_else_is_refused(field: Field, scene: Scene, what: 
 def test_images_without_a_pose_are_converted(field: Field, scene: Scene, tmp_path: Path) -> None:
     pose = ring_pose(3, 24)
     write_png16(tmp_path / "photo.png", _raw(field, pose, 5))
-    convert_images(field, scene, "rgb", "rgb", [tmp_path / "photo.png"], tmp_path / "out")
+    convert_files(field, scene, tmp_path / "out", source="rgb", target="rgb", images=[tmp_path / "photo.png"])
     facts: dict[str, Any] = json.loads((tmp_path / "out/rgb/photo.json").read_text())
     np.testing.assert_allclose(facts["camera"]["camera_to_world"], pose, atol=2e-3)
     assert facts["registration"]["sd_px"] < 0.1 and np.shape(facts["registration"]["covariance"]) == (6, 6)
     write_png16(tmp_path / "other.png", np.random.default_rng(0).random((120, 160)))
     with pytest.raises(InputError, match=r"other\.png: "):
-        convert_images(field, scene, "rgb", "rgb", [tmp_path / "other.png"], tmp_path / "refused")
+        convert_files(field, scene, tmp_path / "refused", source="rgb", target="rgb", images=[tmp_path / "other.png"])
     assert not (tmp_path / "refused").exists()
     write_png16(tmp_path / "small.png", np.zeros((12, 16)))
     with pytest.raises(InputError, match=r"small\.png: the image is 16x12 pixels, expected 160x120"):
-        convert_images(field, scene, "rgb", "rgb", [tmp_path / "small.png"], tmp_path / "refused")
+        convert_files(field, scene, tmp_path / "refused", source="rgb", target="rgb", images=[tmp_path / "small.png"])

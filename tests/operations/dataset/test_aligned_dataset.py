@@ -15,7 +15,8 @@ from torch.utils.data import DataLoader
 import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.operations.dataset.aligned import AlignedDataset, crop_and_flip
-from mmsynth.operations.dataset.generate import FORMATS, generate_dataset
+from mmsynth.operations.dataset.generate import DATASET_FORMATS, generate_dataset
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, intensities_to_stokes
 
@@ -24,11 +25,11 @@ CAMERA = Camera(24, 18, 26.0, 26.0, 11.3, 8.6, (-0.1, 0.05, 0.001, -0.002))
 
 def made(folder: Path, format: str, count: int = 3, **how: Any) -> AlignedDataset:
     field: Any = AnalyticField(sphere())
-    generate_dataset(field, [(CAMERA, ring_pose(i, 9), f"{i}") for i in range(count)], folder, format=format, **how)
+    generate_dataset(field, [PosedCamera(CAMERA, ring_pose(i, 9), f"{i}") for i in range(count)], folder, file_format=format, **how)
     return AlignedDataset(folder)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", DATASET_FORMATS)
 def test_every_format_gives_the_same_tensors(tmp_path: Path, format: str) -> None:
     field = AnalyticField(sphere())
     dataset = made(tmp_path, format)
@@ -125,7 +126,7 @@ def test_a_mirrored_picture_is_that_of_a_mirrored_scene(tmp_path: Path) -> None:
     light = np.array([0.3, -0.5, 0.8])
     pose = look_at(2.5 * np.array([0.3, -0.5, 0.3]))
     field: Any = AnalyticField(sphere())  # its light lies in the plane of symmetry, as the camera does
-    generate_dataset(field, [(camera, pose, "0"), (camera, pose, "1")], tmp_path)
+    generate_dataset(field, [PosedCamera(camera, pose, "0"), PosedCamera(camera, pose, "1")], tmp_path)
     assert abs(np.linalg.det(np.stack([light, pose[:3, 3], [0, 0, 1]]))) < 1e-12
     dataset = AlignedDataset(tmp_path)
     item = dataset[0]

@@ -11,18 +11,18 @@ import pytest
 from analytic import AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.operations.dataset.generate import FORMATS, generate_dataset
-from mmsynth.operations.dataset.index import verify
-from mmsynth.operations.output.work_partition import Share, share_of_environment
+from mmsynth.operations.dataset.generate import DATASET_FORMATS, generate_dataset
+from mmsynth.operations.dataset.index import verify_dataset
+from mmsynth.operations.output.work_partition import WorkPartition, partition_of_environment
 from mmsynth.operations.views.coverage import training_rays
 from mmsynth.operations.views.flow import optical_flow
-from mmsynth.operations.views.trajectories import View
 from mmsynth.scene.images import read_image
-from mmsynth.scene.poses import read_poses
+from mmsynth.scene.load import read_poses
+from mmsynth.scene.scene import PosedCamera
 
 
-def views_of(field: AnalyticField, count: int = 2) -> list[View]:
-    return [(field.cameras["rgb"], ring_pose(i, 7), f"view {i}") for i in range(count)]
+def views_of(field: AnalyticField, count: int = 2) -> list[PosedCamera]:
+    return [PosedCamera(field.cameras["rgb"], ring_pose(i, 7), f"view {i}") for i in range(count)]
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -30,28 +30,31 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("rig", ["aligned", "native"])
-@pytest.mark.parametrize("format", FORMATS)
-def test_complete_and_identical_on_rerun(tmp_path: Path, rig: str, format: str) -> None:
+@pytest.mark.parametrize("file_format", DATASET_FORMATS)
+def test_complete_and_identical_on_rerun(tmp_path: Path, rig: Any, file_format: Any) -> None:
     field = AnalyticField(sphere())
     calls: list[tuple[int, int]] = []
-    path = generate_dataset(field, views_of(field), tmp_path / "a", rig=rig, format=format, progress=lambda *c: calls.append(c))  # type: ignore[arg-type]
-    assert path == tmp_path / "a/dataset.json" and verify(tmp_path / "a") == []
+    path = generate_dataset(
+        field, views_of(field), tmp_path / "a", rig=rig, file_format=file_format, progress=lambda *c: calls.append(c)
+    ).path  # type: ignore[arg-type]
+    assert path == tmp_path / "a/dataset.json" and verify_dataset(tmp_path / "a") == []
     assert calls[-1][0] == calls[-1][1] and calls == sorted(calls)
     stated = json.loads(path.read_text())
     assert set(stated["modalities"]) == {"rgb", "ms", "pol", "mono"} and stated["unit"] == "m" and len(stated["field"]) == 64
-    for view in stated["views"] if format != "webdataset" else []:
+    for view in stated["views"] if file_format != "webdataset" else []:
         on_disk = {p.name for p in (tmp_path / "a" / view["folder"]).iterdir()}
         assert on_disk == {name for name in view["files"] if "/" not in name} | {"view.json"}
-    generate_dataset(field, views_of(field), tmp_path / "b", rig=rig, format=format)  # type: ignore[arg-type]
+    generate_dataset(field, views_of(field), tmp_path / "b", rig=rig, file_format=file_format)  # type: ignore[arg-type]
     assert content(tmp_path / "a") == content(tmp_path / "b")
 
 
 def test_values_in_every_format(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
-    camera, pose, _ = views_of(field)[0]
-    truth = field.render(camera, pose)
-    for format in ("npz", "exr", "tiff"):
-        generate_dataset(field, views_of(field, 1), tmp_path / format, format=format)  # type: ignore[arg-type]
+    view = views_of(field)[0]
+    truth = field.render(view.camera, view.camera_to_world)
+    file_format: Any
+    for file_format in ("npz", "exr", "tiff"):
+        generate_dataset(field, views_of(field, 1), tmp_path / file_format, file_format=file_format)  # type: ignore[arg-type]
     with np.load(tmp_path / "npz/views/0000/geometry.npz") as arrays:
         for key in ("depth_z", "depth_ray", "normal", "opacity"):
             assert np.array_equal(arrays[key], getattr(truth, key), equal_nan=True), key
@@ -64,23 +67,24 @@ def test_values_in_every_format(tmp_path: Path) -> None:
 
 def test_native_rig(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
-    generate_dataset(field, views_of(field), tmp_path, ["rgb", "polarization"], rig="native")  # type: ignore[arg-type]
+    generate_dataset(field, views_of(field), tmp_path, modalities=["rgb", "polarization"], rig="native")  # type: ignore[arg-type]
     pose = ring_pose(1, 7) @ field.rig["pol"]
     truth = field.render(field.cameras["pol"], pose, ["pol"])
     with np.load(tmp_path / "views/0001/pol.npz") as arrays:
         assert np.array_equal(arrays["data"], truth.channels["pol"], equal_nan=True)
     with np.load(tmp_path / "views/0001/geometry_pol.npz") as arrays:
         assert np.array_equal(arrays["depth_z"], truth.depth_z, equal_nan=True)
-    assert np.allclose(read_poses(tmp_path / "transforms_pol.json")[1][1], pose)
+    assert np.allclose(read_poses(tmp_path / "transforms_pol.json")[1].camera_to_world, pose)
 
 
 def test_transforms_come_back(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     generate_dataset(field, views_of(field), tmp_path)  # type: ignore[arg-type]
-    for (camera, pose, _), (read_camera, read_pose, _) in zip(views_of(field), read_poses(tmp_path / "transforms.json"), strict=True):
-        assert read_camera is not None
-        assert np.allclose(read_pose, pose, atol=1e-12) and np.allclose(read_camera.matrix, camera.matrix)
-        assert np.allclose(read_camera.coefficients, camera.coefficients)
+    for view, read in zip(views_of(field), read_poses(tmp_path / "transforms.json"), strict=True):
+        assert read.camera is not None
+        assert np.allclose(read.camera_to_world, view.camera_to_world, atol=1e-12)
+        assert np.allclose(read.camera.matrix, view.camera.matrix)
+        assert np.allclose(read.camera.coefficients, view.camera.coefficients)
 
 
 def test_resumes(tmp_path: Path) -> None:
@@ -105,17 +109,20 @@ def test_resumes(tmp_path: Path) -> None:
     assert renders(0.5) == 3  # another field
 
 
-@pytest.mark.parametrize("format", ["npz", "webdataset"])
-def test_processes_make_the_same_bytes_as_one(tmp_path: Path, format: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("file_format", ["npz", "webdataset"])
+def test_processes_make_the_same_bytes_as_one(tmp_path: Path, file_format: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes last writes the summary; nobody waits, and a view at the border of two shares has its flow to the next."""
     monkeypatch.setattr("mmsynth.operations.dataset.generate.PER_SHARD", 2)
     monkeypatch.setattr("mmsynth.operations.dataset.index.PER_SHARD", 2)
     field: Any = AnalyticField(sphere())
-    generate_dataset(field, views_of(field, 5), tmp_path / "one", format=format)
-    written = [generate_dataset(field, views_of(field, 5), tmp_path / "many", format=format, share=Share(k, 3)) for k in (2, 0, 1)]
+    generate_dataset(field, views_of(field, 5), tmp_path / "one", file_format=file_format)
+    written = [
+        generate_dataset(field, views_of(field, 5), tmp_path / "many", file_format=file_format, part=WorkPartition(k, 3)).path
+        for k in (2, 0, 1)
+    ]
     assert written == [None, None, tmp_path / "many/dataset.json"]
     assert content(tmp_path / "one") == content(tmp_path / "many")
-    assert len(json.loads(written[2].read_text())["views"]) == 5 and verify(tmp_path / "many") == []  # type: ignore[union-attr]
+    assert len(json.loads(written[2].read_text())["views"]) == 5 and verify_dataset(tmp_path / "many") == []  # type: ignore[union-attr]
 
 
 def test_views_whose_shard_is_still_to_come_are_not_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,41 +130,41 @@ def test_views_whose_shard_is_still_to_come_are_not_finished(tmp_path: Path, mon
     monkeypatch.setattr("mmsynth.operations.dataset.generate.PER_SHARD", 2)
     monkeypatch.setattr("mmsynth.operations.dataset.index.PER_SHARD", 2)
     field: Any = AnalyticField(sphere())
-    make = lambda out, **how: generate_dataset(field, views_of(field, 4), out, format="webdataset", **how)
+    make = lambda out, **how: generate_dataset(field, views_of(field, 4), out, file_format="webdataset", **how).path
     make(tmp_path / "one")
     with monkeypatch.context() as late:
         late.setattr("mmsynth.operations.dataset.generate.pack_shard", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            make(tmp_path / "two", share=Share(0, 2))
-    assert make(tmp_path / "two", share=Share(1, 2)) is None
-    assert make(tmp_path / "two", share=Share(0, 2)) is not None and content(tmp_path / "one") == content(tmp_path / "two")
+            make(tmp_path / "two", part=WorkPartition(0, 2))
+    assert make(tmp_path / "two", part=WorkPartition(1, 2)) is None
+    assert make(tmp_path / "two", part=WorkPartition(0, 2)) is not None and content(tmp_path / "one") == content(tmp_path / "two")
 
 
 def test_shares_cover_everything_once(monkeypatch: pytest.MonkeyPatch) -> None:
     for units, together, processes in [(10, 1, 3), (10, 4, 3), (3, 1, 8), (130, 64, 2), (0, 1, 2)]:
-        shares = [Share(k, processes).of(units, together) for k in range(processes)]
+        shares = [WorkPartition(k, processes).of(units, together) for k in range(processes)]
         assert [i for share in shares for i in share] == list(range(units))
         assert all(share.start % together == 0 for share in shares if len(share))
     for rank, size, good in [("1", "4", True), ("4", "4", False), ("a", "2", False), ("-1", "2", False)]:
         monkeypatch.setenv("RANK", rank)
         monkeypatch.setenv("WORLD_SIZE", size)
         if good:
-            assert share_of_environment() == Share(1, 4)
+            assert partition_of_environment() == WorkPartition(1, 4)
         else:
             with pytest.raises(InputError, match=f"RANK is '{rank}' and WORLD_SIZE '{size}'"):
-                share_of_environment()
+                partition_of_environment()
 
 
 def test_a_shard_that_was_cut_off_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mmsynth.operations.dataset.generate.PER_SHARD", 2)
     monkeypatch.setattr("mmsynth.operations.dataset.index.PER_SHARD", 2)
     field: Any = AnalyticField(sphere())
-    generate_dataset(field, views_of(field, 5), tmp_path / "whole", format="webdataset")
+    generate_dataset(field, views_of(field, 5), tmp_path / "whole", file_format="webdataset")
     before = content(tmp_path / "whole")
 
     def again(made: int) -> None:
         counted = AnalyticField(sphere())
-        generate_dataset(counted, views_of(field, 5), tmp_path / "whole", format="webdataset")  # type: ignore[arg-type]
+        generate_dataset(counted, views_of(field, 5), tmp_path / "whole", file_format="webdataset")  # type: ignore[arg-type]
         assert content(tmp_path / "whole") == before and counted.renders == made
 
     again(0)
@@ -165,7 +172,7 @@ def test_a_shard_that_was_cut_off_is_finished(tmp_path: Path, monkeypatch: pytes
     again(3)  # its two views, and the depth of the next for the flow
     path = tmp_path / "whole/shards/000002.tar"
     path.write_bytes(path.read_bytes()[:-1])
-    assert [p for p in verify(tmp_path / "whole") if "000002.tar" in p]
+    assert [p for p in verify_dataset(tmp_path / "whole") if "000002.tar" in p]
     again(1)
     folder = tmp_path / "whole/views/0000"  # killed between the sidecar and the removal of the folders
     folder.mkdir(parents=True)
@@ -177,23 +184,23 @@ def test_flow_coverage_and_what_was_asked_for(tmp_path: Path) -> None:
     field: Any = AnalyticField(sphere())
     views = views_of(field, 3)
     rays = training_rays(field, scene_of(field, tmp_path / "scene", views=4, truth=False))
-    generate_dataset(field, views, tmp_path / "all", ["mono"], rays=rays)
-    seen = [field.render(*view[:2], ["mono"]) for view in views]
+    generate_dataset(field, views, tmp_path / "all", modalities=["mono"], rays=rays)
+    seen = [field.render(view.camera, view.camera_to_world, ["mono"]) for view in views]
     for i in range(2):
-        flow, occluded = optical_flow(*views[i][:2], seen[i].depth_ray, seen[i].normal, *views[i + 1][:2], seen[i + 1].depth_ray)
+        flow, occluded = optical_flow(views[i], seen[i].depth_ray, seen[i].normal, views[i + 1], seen[i + 1].depth_ray)
         with np.load(tmp_path / f"all/views/{i:04d}/flow.npz") as arrays:
             assert np.array_equal(arrays["flow"], flow, equal_nan=True) and np.array_equal(arrays["occluded"], occluded)
     view = json.loads((tmp_path / "all/views/0001/view.json").read_text())
     with np.load(tmp_path / "all/views/0001/geometry.npz") as arrays:
         assert view["coverage_score"] == pytest.approx(np.nanmean(arrays["coverage"]), rel=1e-6) and 0 < view["coverage_score"] < 1
         assert np.array_equal(np.isnan(arrays["coverage"]), np.isnan(arrays["depth_z"])) and not arrays["saturated_mono"].any()
-    generate_dataset(field, views, tmp_path / "few", ["mono"], outputs=[])
+    generate_dataset(field, views, tmp_path / "few", modalities=["mono"], outputs=[])
     assert {p.name for p in (tmp_path / "few/views/0000").iterdir()} == {"mono.npz", "image.png", "view.json"}
-    generate_dataset(field, views, tmp_path / "flow", ["mono"], outputs=["flow"])
+    generate_dataset(field, views, tmp_path / "flow", modalities=["mono"], outputs=["flow"])
     assert {p.name for p in (tmp_path / "flow/views/0000").iterdir()} == {"mono.npz", "flow.npz", "image.png", "view.json"}
     # another next view: another flow, so another request
     counted = AnalyticField(sphere())
-    generate_dataset(counted, [*views[:2], views[0]], tmp_path / "all", ["mono"], rays=rays)  # type: ignore[arg-type]
+    generate_dataset(counted, [*views[:2], views[0]], tmp_path / "all", modalities=["mono"], rays=rays)  # type: ignore[arg-type]
     assert counted.renders == 2
 
 
@@ -206,7 +213,7 @@ def test_a_run_that_is_cut_off_has_no_summary_of_the_last_one(tmp_path: Path) ->
         generate_dataset(other, views_of(field, 2), tmp_path)
     assert not (tmp_path / "dataset.json").exists()
     generate_dataset(field, views_of(field, 2), tmp_path)
-    assert verify(tmp_path) == []
+    assert verify_dataset(tmp_path) == []
 
 
 def test_verify_finds_damage(tmp_path: Path) -> None:
@@ -217,7 +224,7 @@ def test_verify_finds_damage(tmp_path: Path) -> None:
     damaged[len(damaged) // 2] ^= 1
     (tmp_path / "views/0001/ms.npz").write_bytes(damaged)
     (tmp_path / "views/0002/view.json").unlink()
-    problems = verify(tmp_path)
+    problems = verify_dataset(tmp_path)
     assert len(problems) == 3
     for problem, name in zip(problems, ("0000/rgb.npz", "0001/ms.npz", "0002/view.json"), strict=True):
         assert name in problem.replace("\\", "/")
@@ -229,7 +236,7 @@ def test_refuses(tmp_path: Path) -> None:
     out = tmp_path / "out"
     for arguments, message in [
         ({"rig": "both"}, "aligned, native"),
-        ({"format": "jpg"}, "npz, exr, tiff"),
+        ({"file_format": "jpg"}, "npz, exr, tiff"),
         ({"modalities": ["thermal"]}, "'thermal'"),
         ({"modalities": []}, "no modalities"),
         ({"outputs": ["masks"]}, "output 'masks', expected some of geometry, flow, coverage"),
@@ -243,5 +250,5 @@ def test_refuses(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'pol' has no known place"):
         generate_dataset(field, views, out, rig="native")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"dataset\.json"):
-        verify(out)
+        verify_dataset(out)
     assert not out.exists()

@@ -13,8 +13,9 @@ from analytic import MS, RGB, AnalyticField, scene_of, sphere
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Rendering
-from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim, spectral_angle_deg
-from mmsynth.scene.images import write_png16
+from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim
+from mmsynth.scene.image_writers import write_png16
+from mmsynth.sensors.metrics import spectral_angle_deg
 
 
 class Changed(AnalyticField):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -30,18 +31,18 @@ def arrays_of(sensor: Sensor) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("sensor", [RGB, MONO, MS, POL], ids=lambda s: s.name)
-@pytest.mark.parametrize("format", ["npz", "exr", "tiff"])
-def test_what_is_written_comes_back(tmp_path: Path, sensor: Sensor, format: str) -> None:
+@pytest.mark.parametrize("file_format", ["npz", "exr", "tiff"])
+def test_what_is_written_comes_back(tmp_path: Path, sensor: Sensor, file_format: Any) -> None:
     arrays = arrays_of(sensor)
-    files = write_record(tmp_path, sensor.name, arrays, format, UNITS, sensor)
-    files |= write_record(tmp_path, "other", {"depth_z": arrays["confidence"]}, format, {"depth_z": "m"})
+    files = write_record(tmp_path, sensor.name, arrays, file_format, units=UNITS, sensor=sensor)
+    files |= write_record(tmp_path, "other", {"depth_z": arrays["confidence"]}, file_format, units={"depth_z": "m"})
     back = read_record(tmp_path, files, sensor.name)
     assert back.keys() == arrays.keys()
     for key, array in arrays.items():
         assert back[key].dtype == array.dtype, key
-        if key == "data" and format == "tiff":
+        if key == "data" and file_format == "tiff":
             np.testing.assert_allclose(back[key][1:], array[1:], atol=0.51 / 65535)
-        elif array.dtype == np.float64 and format != "npz":
+        elif array.dtype == np.float64 and file_format != "npz":
             np.testing.assert_allclose(back[key], array, rtol=1e-7)
         else:
             np.testing.assert_array_equal(back[key], array, key)
@@ -58,7 +59,7 @@ def test_what_is_written_comes_back(tmp_path: Path, sensor: Sensor, format: str)
 
 def test_spectra_and_stokes_vectors_have_the_names_of_the_spectral_layout(tmp_path: Path) -> None:
     for sensor in (MS, POL, RGB):
-        write_record(tmp_path, sensor.name, modality_arrays(**_of(sensor)), "exr", UNITS, sensor)
+        write_record(tmp_path, sensor.name, modality_arrays(**_of(sensor)), "exr", units=UNITS, sensor=sensor)
     ms, pol, rgb = (OpenEXR.File(str(tmp_path / f"{n}.exr"), separate_channels=True) for n in ("ms", "pol", "rgb"))
     assert {"S0.692,000000nm", "S0.431,000000nm", "pan", "R", "G", "B"} < set(ms.channels()) and len(ms.channels()) == 12
     assert ms.channels()["R"].pixels.dtype == np.float16 and ms.header()["spectralLayoutVersion"] == "1.0"

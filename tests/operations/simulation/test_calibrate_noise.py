@@ -15,8 +15,9 @@ from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.operations.simulation.calibrate_noise import by_modality, calibrate_from_frames, calibrate_noise, write
 from mmsynth.operations.simulation.simulate import simulate
-from mmsynth.scene.images import write_npz, write_png
+from mmsynth.scene.image_writers import write_npz, write_png
 from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.noise import NoiseModel, record
 from mmsynth.sensors.sensor_file import SensorFile, load_sensor, save_sensor
@@ -64,8 +65,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulate(
         field,
         [sensor_file(s.name, folder) for s in (RGB, MS, POL, MONO)],
-        [(camera, ring_pose(i, 6), str(i)) for i in range(6)],
         folder / "scene",
+        views=[PosedCamera(camera, ring_pose(i, 6), str(i)) for i in range(6)],
     )
     return folder
 
@@ -83,8 +84,8 @@ def test_the_figures_of_a_scenes_sensors_come_back(made: Path, tmp_path: Path) -
     scene = load_scene(made / "scene")
     known = by_modality([load_sensor(made / f"{name}.toml") for name in ("rgb", "ms", "pol", "mono")])
     told: list[tuple[int, int]] = []
-    found, untold = calibrate_noise(field, scene, known=known, progress=lambda done, total: told.append((done, total)))
-    assert not untold and list(found) == list(scene.sensors) and told[-1][0] == told[-1][1]
+    found, failed = calibrate_noise(field, scene, known=known, progress=lambda done, total: told.append((done, total)))
+    assert not failed and list(found) == list(scene.sensors) and told[-1][0] == told[-1][1]
     for c in found.values():
         p = c.found
         assert c.frames == 5 and p.gain_dn_e == pytest.approx(0.4, rel=0.1) and abs(p.gain_dn_e - 0.4) < 4 * p.gain_sd
@@ -103,7 +104,7 @@ def test_the_figures_of_a_scenes_sensors_come_back(made: Path, tmp_path: Path) -
 
 def test_without_a_file_bits_are_those_in_use_and_black_is_zero(made: Path) -> None:
     field: Field = WithBlack(sphere())  # type: ignore[assignment]
-    (c,) = calibrate_noise(field, load_scene(made / "scene"), ["mono"])[0].values()
+    (c,) = calibrate_noise(field, load_scene(made / "scene"), modalities=["mono"])[0].values()
     assert c.file.noise.bits == 12 and c.file.noise.black_dn == 0
     # variance over the mean with the black level taken for light: K is told too small, by what the curve's constant cannot take up
     assert 0.3 < c.found.gain_dn_e < 0.42
@@ -114,11 +115,11 @@ def test_other_frames_of_the_same_poses(made: Path, tmp_path: Path) -> None:
     scene = load_scene(made / "scene")
     known = by_modality([load_sensor(made / "mono.toml")])
     raw = made / "scene" / "modalities"
-    (all_of_them,) = calibrate_noise(field, scene, ["mono"], known, raw)[0].values()
-    (two,) = calibrate_noise(field, scene, ["mono"], known, raw, [1, 2])[0].values()
+    (all_of_them,) = calibrate_noise(field, scene, modalities=["mono"], known=known, raw=raw)[0].values()
+    (two,) = calibrate_noise(field, scene, modalities=["mono"], known=known, raw=raw, views=[1, 2])[0].values()
     assert all_of_them.frames == 6 and two.frames == 2 and two.found.gain_dn_e == pytest.approx(0.4, rel=0.1)
     with pytest.raises(InputError, match="no frames of mono to calibrate from"):
-        calibrate_noise(field, scene, ["mono"], known, tmp_path)
+        calibrate_noise(field, scene, modalities=["mono"], known=known, raw=tmp_path)
 
 
 def test_frames_of_a_short_exposure_tell_the_read_noise(made: Path, tmp_path: Path) -> None:
@@ -132,7 +133,7 @@ def test_frames_of_a_short_exposure_tell_the_read_noise(made: Path, tmp_path: Pa
         raw = record(exposure * light[None], TRUE, [frame.view], "short")[0].numpy()
         (tmp_path / "mono").mkdir(exist_ok=True)
         write_png(tmp_path / "mono" / f"{frame.view:04d}.png", raw.astype(np.uint16) << 4)
-    (c,) = calibrate_noise(field, scene, ["mono"], known, tmp_path)[0].values()  # type: ignore[arg-type]
+    (c,) = calibrate_noise(field, scene, modalities=["mono"], known=known, raw=tmp_path)[0].values()  # type: ignore[arg-type]
     assert c.exposure == pytest.approx([1 / 12, 1 / 16] * 3, rel=0.01)
     assert c.found.read_e == pytest.approx(6.0, rel=0.1) and abs(c.found.read_e - 6.0) < 4 * c.found.read_sd < 4
     assert c.found.gain_dn_e == pytest.approx(0.4, rel=0.1)
@@ -172,9 +173,9 @@ def test_a_sensor_that_saw_texture_alone_does_not_keep_the_others_back(made: Pat
 
     field.render = rough  # type: ignore[method-assign]
     known = by_modality([load_sensor(made / f"{name}.toml") for name in ("rgb", "mono")])
-    found, untold = calibrate_noise(field, load_scene(made / "scene"), ["rgb", "mono"], known)
-    assert list(found) == ["mono"] and list(untold) == ["rgb"]
-    assert untold["rgb"].startswith("rgb: photon transfer: ")
+    found, failed = calibrate_noise(field, load_scene(made / "scene"), modalities=["rgb", "mono"], known=known)
+    assert list(found) == ["mono"] and list(failed) == ["rgb"]
+    assert failed["rgb"].startswith("rgb: photon transfer: ")
 
 
 def test_what_is_no_converters_is_refused(made: Path, tmp_path: Path) -> None:
@@ -182,7 +183,7 @@ def test_what_is_no_converters_is_refused(made: Path, tmp_path: Path) -> None:
     scene = load_scene(made / "scene")
     known = load_sensor(made / "mono.toml")
     with pytest.raises(InputError, match="'thermal': not in this field"):
-        calibrate_noise(field, scene, ["thermal"])
+        calibrate_noise(field, scene, modalities=["thermal"])
     with pytest.raises(InputError, match="expected one file for each captured sensor"):
         by_modality([known, known])
     flat = tmp_path / "flat.png"

@@ -14,7 +14,7 @@ from conftest import look_at, ring
 
 from mmsynth.errors import InputError
 from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, training_rays, view_score, view_scores
-from mmsynth.scene.scene import Frame, Region, Scene, Split
+from mmsynth.scene.scene import Frame, PosedCamera, Region, Scene, Split
 from mmsynth.sensors.camera import Camera, project, resized, surface_points, unproject
 
 LENS = Camera(121, 91, 130.0, 128.0, 60.0, 45.0, (-0.12, 0.06, 0.002, -0.001))
@@ -44,7 +44,7 @@ def rays_of(field: Any, *poses: np.ndarray, camera: Camera = LENS) -> TrainingRa
 def covered(field: Any, rays: TrainingRays, pose: np.ndarray, camera: Camera = LENS) -> tuple[np.ndarray, np.ndarray]:
     """Coverage (H, W) and points (H, W, 3)."""
     seen = field.render(camera, pose, [])
-    out = coverage(rays, camera, pose, seen.depth_ray, seen.normal)
+    out = coverage(rays, PosedCamera(camera, pose), seen.depth_ray, seen.normal)
     assert out.dtype == np.float32 and np.array_equal(np.isnan(out), np.isnan(seen.depth_ray))
     return out, surface_points(camera, pose, seen.depth_ray)
 
@@ -63,7 +63,7 @@ def test_training_pose_is_covered(camera: Camera) -> None:
     hit = np.isfinite(out)
     assert hit.sum() > 1000
     np.testing.assert_array_equal(out[hit], 1.0)
-    assert view_score(field, rays, camera, poses[3]) == 1.0
+    assert view_score(field, rays, PosedCamera(camera, poses[3])) == 1.0
 
 
 def test_opposite_side_is_not() -> None:
@@ -71,7 +71,7 @@ def test_opposite_side_is_not() -> None:
     rays = rays_of(field, turned(-20), turned(20))
     out, _ = covered(field, rays, turned(180))
     assert np.isfinite(out).sum() > 1000 and np.nanmax(out) == 0.0
-    assert view_score(field, rays, LENS, turned(180)) == 0.0
+    assert view_score(field, rays, PosedCamera(LENS, turned(180))) == 0.0
 
 
 @pytest.mark.parametrize("degrees", [0.0, 5.0, 20.0, 40.0, 60.0])
@@ -89,7 +89,7 @@ def test_angle(degrees: float) -> None:
 
 def test_falls_with_the_angle() -> None:
     field = field_of(sphere())
-    scores = [view_score(field, rays_of(field, turned(0)), LENS, turned(degrees)) for degrees in range(0, 181, 20)]
+    scores = [view_score(field, rays_of(field, turned(0)), PosedCamera(LENS, turned(degrees))) for degrees in range(0, 181, 20)]
     assert scores[0] == 1.0 and scores[-1] == 0.0
     assert all(b < a or a == b == 0.0 for a, b in pairwise(scores))
 
@@ -144,7 +144,7 @@ def test_no_surface_no_coverage() -> None:
     rays = rays_of(field, turned(0))
     out, _ = covered(field, rays, look_at((2.0, 0.0, 0.0), (4.0, 0.0, 0.0)))
     assert np.isnan(out).all()
-    assert view_score(field, rays, LENS, look_at((2.0, 0.0, 0.0), (4.0, 0.0, 0.0))) == 0.0
+    assert view_score(field, rays, PosedCamera(LENS, look_at((2.0, 0.0, 0.0), (4.0, 0.0, 0.0)))) == 0.0
 
 
 def test_far_from_the_origin() -> None:
@@ -157,25 +157,25 @@ def test_far_from_the_origin() -> None:
     # the double's own ray steps and normals lose digits there, not coverage: geometry is given
     seen = near.render(LENS, turned(25), [])
     rays = rays_of(far, moved @ turned(0), moved @ turned(60))
-    again = coverage(rays, LENS, moved @ turned(25), seen.depth_ray, seen.normal)
+    again = coverage(rays, PosedCamera(LENS, moved @ turned(25)), seen.depth_ray, seen.normal)
     np.testing.assert_allclose(again, out, atol=1e-5)
 
 
 def test_score_is_the_mean_coverage() -> None:
     field = field_of(sphere())
     rays = rays_of(field, turned(0), turned(60))
-    views = [(LENS, turned(degrees), str(degrees)) for degrees in (20, 100)]
+    views = [PosedCamera(LENS, turned(degrees), str(degrees)) for degrees in (20, 100)]
     ticks: list[tuple[int, int]] = []
     scores = view_scores(field, rays, views, lambda done, total: ticks.append((done, total)))
-    for score, (_, pose, _) in zip(scores, views, strict=True):
-        assert score == pytest.approx(np.nanmean(covered(field, rays, pose)[0]), abs=0.02)
+    for score, view in zip(scores, views, strict=True):
+        assert score == pytest.approx(np.nanmean(covered(field, rays, view.camera_to_world)[0]), abs=0.02)
     assert ticks == [(1, 2), (2, 2)]
 
 
 def test_frames_of_all_or_some_modalities_count() -> None:
     field = field_of(sphere())
     scene = scene_with([turned(0), turned(180)], others=[(turned(90), FISHEYE)])  # the second tests: not a training frame
-    scores = lambda rays: [round(view_score(field, rays, LENS, turned(degrees)), 3) for degrees in (0, 90, 180)]
+    scores = lambda rays: [round(view_score(field, rays, PosedCamera(LENS, turned(degrees))), 3) for degrees in (0, 90, 180)]
     assert scores(training_rays(field, scene, ["rgb"]))[0::2] == [1.0, 0.0]
     of_mono, of_all = scores(training_rays(field, scene, ["mono"])), scores(training_rays(field, scene))
     assert of_mono[1] > 0.8 and of_all[0] == 1.0 and of_all[1] == of_mono[1] and of_all[2] < 0.2
@@ -186,7 +186,7 @@ def test_frames_of_all_or_some_modalities_count() -> None:
 
 
 def test_covered_views() -> None:
-    views = [(LENS, turned(degrees), f"{degrees:04d}") for degrees in (0, 50, 180)]
+    views = [PosedCamera(LENS, turned(degrees), f"{degrees:04d}") for degrees in (0, 50, 180)]
     assert covered_views(views, [1.0, 0.5, 0.0], 0.5) == (views[:2], [("0180", 0.0)])
     assert covered_views(views, [1.0, 0.5, 0.0], 0.0) == (views, [])
     with pytest.raises(InputError, match=r"the best of 3 views has 0\.400, expected one with 0\.5 or more"):

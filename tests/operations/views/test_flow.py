@@ -10,6 +10,7 @@ from conftest import look_at
 from scipy.spatial.transform import Rotation
 
 from mmsynth.operations.views.flow import optical_flow
+from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera, ray_map, surface_points
 
 PINHOLE = Camera(64, 48, 70.0, 68.0, 31.0, 24.5)
@@ -43,7 +44,9 @@ def test_pure_rotation_is_a_homography() -> None:
     pose_b = np.eye(4)
     pose_b[:3, :3] = Rotation.from_euler("yxz", (0.2, -0.1, 0.3)).as_matrix()
     depth = np.random.default_rng(0).uniform(1, 3, (48, 64)).astype(np.float32)  # whatever is there
-    flow, occluded = optical_flow(PINHOLE, np.eye(4), depth, -ray_map(PINHOLE)[0], PINHOLE, pose_b, nothing(PINHOLE))
+    flow, occluded = optical_flow(
+        PosedCamera(PINHOLE, np.eye(4)), depth, -ray_map(PINHOLE)[0], PosedCamera(PINHOLE, pose_b), nothing(PINHOLE)
+    )
     homography = PINHOLE.matrix @ pose_b[:3, :3].T @ np.linalg.inv(PINHOLE.matrix)
     expected = cv2.perspectiveTransform(grid(PINHOLE).reshape(-1, 1, 2), homography).reshape(48, 64, 2)
     assert flow.dtype == np.float32 and np.abs(flow).max() > 10
@@ -57,7 +60,7 @@ def test_plane_before_a_moving_camera() -> None:
     pose_b[:3, 3] = (0.5, -0.2, 1.0)
     depth, normal = plane(PINHOLE, np.eye(4), np.array([0.0, 0.0, -1.0]), -4.0)
     depth_b, _ = plane(PINHOLE, pose_b, np.array([0.0, 0.0, -1.0]), -4.0)
-    flow, occluded = optical_flow(PINHOLE, np.eye(4), depth, normal, PINHOLE, pose_b, depth_b)
+    flow, occluded = optical_flow(PosedCamera(PINHOLE, np.eye(4)), depth, normal, PosedCamera(PINHOLE, pose_b), depth_b)
     expected = (grid(PINHOLE) - [31.0, 24.5]) * 4 / 3 - np.array([70.0 * 0.5, -68.0 * 0.2]) / 3 + [31.0, 24.5]
     np.testing.assert_allclose(flow, expected - grid(PINHOLE), atol=2e-5)
     assert np.array_equal(occluded, ~inside(expected, PINHOLE))
@@ -66,7 +69,7 @@ def test_plane_before_a_moving_camera() -> None:
 def test_no_motion_no_flow() -> None:
     pose = look_at((2.0, 1.0, 0.5))
     depth, normal = plane(BROWN, pose, np.array([0.0, 0.0, 1.0]) + pose[:3, 2] * -2, -6.0)
-    flow, occluded = optical_flow(BROWN, pose, depth, normal / np.sqrt(5), BROWN, pose, depth)
+    flow, occluded = optical_flow(PosedCamera(BROWN, pose), depth, normal / np.sqrt(5), PosedCamera(BROWN, pose), depth)
     np.testing.assert_allclose(flow, 0.0, atol=1e-5)
     assert not occluded.any()
 
@@ -79,7 +82,7 @@ def test_lenses_against_opencv(camera_a: Camera, camera_b: Camera) -> None:
     pose_b[:3, 3] = (0.3, 0.2, -0.4)
     normal = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
     depth, normals = plane(camera_a, np.eye(4), normal, -2.0)
-    flow, _ = optical_flow(camera_a, np.eye(4), depth, normals, camera_b, pose_b, nothing(camera_b))
+    flow, _ = optical_flow(PosedCamera(camera_a, np.eye(4)), depth, normals, PosedCamera(camera_b, pose_b), nothing(camera_b))
 
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     flat = grid(camera_a).reshape(-1, 1, 2)
@@ -104,7 +107,7 @@ def test_hidden_by_a_nearer_ball() -> None:
     field = AnalyticField(lambda p: np.minimum(sphere(big)(p), sphere(small, between)(p)), [RGB])
     pose_a, pose_b = look_at((1.6, 1.9, 0.3)), look_at((2.5, 0.0, 0.1))
     a, b = field.render(camera, pose_a, []), field.render(camera, pose_b, [])
-    flow, occluded = optical_flow(camera, pose_a, a.depth_ray, a.normal, camera, pose_b, b.depth_ray)
+    flow, occluded = optical_flow(PosedCamera(camera, pose_a), a.depth_ray, a.normal, PosedCamera(camera, pose_b), b.depth_ray)
     hit = np.isfinite(a.depth_ray)
     assert np.array_equal(np.isfinite(flow).all(-1), hit) and not occluded[~hit].any()
 
@@ -124,10 +127,10 @@ def test_points_that_the_other_lens_does_not_see() -> None:
     depth[:10] = np.nan
     behind = np.eye(4)
     behind[:3, 3] = (0.0, 0.0, 5.0)
-    flow, occluded = optical_flow(PINHOLE, np.eye(4), depth, normal, PINHOLE, behind, nothing(PINHOLE))
+    flow, occluded = optical_flow(PosedCamera(PINHOLE, np.eye(4)), depth, normal, PosedCamera(PINHOLE, behind), nothing(PINHOLE))
     assert np.isnan(flow).all() and occluded[10:].all() and not occluded[:10].any()
     folded = Camera(64, 48, 70.0, 68.0, 31.0, 24.5, (-1.5, 0.0, 0.0, 0.0))  # r (1 - 1.5 r²) turns back at r = √(2 / 9)
-    flow, occluded = optical_flow(PINHOLE, np.eye(4), depth, normal, folded, np.eye(4), nothing(folded))
+    flow, occluded = optical_flow(PosedCamera(PINHOLE, np.eye(4)), depth, normal, PosedCamera(folded, np.eye(4)), nothing(folded))
     radius = np.linalg.norm((grid(PINHOLE) - [31.0, 24.5]) / [70.0, 68.0], axis=-1)
     expected = (radius < np.sqrt(2 / 9)) & np.isfinite(depth)
     assert np.array_equal(np.isfinite(flow).all(-1), expected) and 0 < expected.sum() < np.isfinite(depth).sum()

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import RGB, AnalyticField, ring_pose, scene_of, sphere
+from conftest import unpacked
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from mmsynth.errors import InputError
-from mmsynth.operations.views.trajectories import load_views, look_at, trajectory_views, world_up
+from mmsynth.operations.views.load import load_views
+from mmsynth.operations.views.trajectories import look_at, trajectory_views, world_up
 from mmsynth.scene.scene import Frame, Region
 from mmsynth.sensors.camera import Camera
 
@@ -38,8 +40,8 @@ def is_rigid(pose: np.ndarray) -> bool:
 @pytest.mark.parametrize("kind", ["orbit", "hemisphere"])
 def test_around(kind: str) -> None:
     views = trajectory_views({"trajectory": kind, "views": 24}, REGION, CAMERA, TRAINING)
-    assert len(views) == 24 and len({name for _, _, name in views}) == 24
-    for camera, pose, _ in views:
+    assert len(views) == 24 and len({name for _, _, name in unpacked(views)}) == 24
+    for camera, pose, _ in unpacked(views):
         offset = pose[:3, 3] - REGION.centre
         assert camera == CAMERA and is_rigid(pose)
         assert np.linalg.norm(offset) == pytest.approx(np.linalg.norm([2.2, 1.0]))  # as far as the training cameras
@@ -50,12 +52,17 @@ def test_around(kind: str) -> None:
 
 def test_orbit_starts_at_the_first_camera_and_closes() -> None:
     views = trajectory_views({"trajectory": "orbit", "views": 4, "elevation_deg": 0, "radius": 2}, REGION, CAMERA, TRAINING)
-    assert [list(np.round(p[:3, 3] - REGION.centre, 9) + 0.0) for _, p, _ in views] == [[2, 0, 0], [0, 2, 0], [-2, 0, 0], [0, -2, 0]]
+    assert [list(np.round(p[:3, 3] - REGION.centre, 9) + 0.0) for _, p, _ in unpacked(views)] == [
+        [2, 0, 0],
+        [0, 2, 0],
+        [-2, 0, 0],
+        [0, -2, 0],
+    ]
 
 
 def test_hemisphere_is_even() -> None:
     views = trajectory_views({"trajectory": "hemisphere", "views": 200, "min_elevation_deg": 0, "radius": 1}, REGION, CAMERA, TRAINING)
-    points = np.array([p[:3, 3] - REGION.centre for _, p, _ in views])
+    points = np.array([p[:3, 3] - REGION.centre for _, p, _ in unpacked(views)])
     distance = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(len(points))
     assert points[:, 2].min() > 0
     assert distance.min(1).min() > 0.6 * distance.min(1).max()
@@ -64,20 +71,20 @@ def test_hemisphere_is_even() -> None:
 def test_spiral() -> None:
     spec = {"trajectory": "spiral", "views": 9, "turns": 2, "min_elevation_deg": -10, "max_elevation_deg": 70, "radius": 2}
     views = trajectory_views(spec, REGION, CAMERA, TRAINING)
-    offsets = np.array([p[:3, 3] - REGION.centre for _, p, _ in views])
+    offsets = np.array([p[:3, 3] - REGION.centre for _, p, _ in unpacked(views)])
     elevation = np.radians(np.arange(-10, 71, 10))
     turn = np.pi / 2 * np.arange(9)  # two turns in eight steps, from the first training camera's side
     expected = 2 * np.stack([np.cos(elevation) * np.cos(turn), np.cos(elevation) * np.sin(turn), np.sin(elevation)], 1)
     np.testing.assert_allclose(offsets, expected, atol=1e-9)
-    for (_, pose, _), offset in zip(views, offsets, strict=True):
+    for (_, pose, _), offset in zip(unpacked(views), offsets, strict=True):
         assert is_rigid(pose) and pose[:3, 2] == pytest.approx(-offset / 2)
 
 
 def test_interpolate_meets_the_training_poses() -> None:
     views = trajectory_views({"trajectory": "interpolate", "views": 15}, REGION, CAMERA, TRAINING)
-    assert all(is_rigid(p) for _, p, _ in views)
+    assert all(is_rigid(p) for _, p, _ in unpacked(views))
     for i, pose in enumerate(TRAINING):
-        assert np.allclose(views[2 * i][1], pose)
+        assert np.allclose(views[2 * i].camera_to_world, pose)
 
 
 def test_interpolate_at_constant_speed() -> None:
@@ -88,7 +95,7 @@ def test_interpolate_at_constant_speed() -> None:
         pose[:3, 3] = centre + [x, 0.0, -np.sqrt(16 - x * x)]  # all as far from the centre as the reach
     chords = [np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in pairwise(poses)]
     poses[3][:3, :3] = Rotation.from_euler("y", 0.5).as_matrix()
-    views = [p for _, p, _ in trajectory_views({"trajectory": "interpolate", "views": 200}, REGION, CAMERA, poses)]
+    views = [p for _, p, _ in unpacked(trajectory_views({"trajectory": "interpolate", "views": 200}, REGION, CAMERA, poses))]
     way = np.array(
         [
             np.hypot(np.linalg.norm(b[:3, 3] - a[:3, 3]), 4 * Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
@@ -105,16 +112,16 @@ def test_interpolate_does_not_dwell_on_repeated_poses(repeated: list[int]) -> No
     spec = {"trajectory": "interpolate", "views": 13}
     once = trajectory_views(spec, REGION, CAMERA, TRAINING[:4])
     again = trajectory_views(spec, REGION, CAMERA, [TRAINING[i] for i in repeated])
-    np.testing.assert_allclose([p for _, p, _ in again], [p for _, p, _ in once], atol=1e-9)
+    np.testing.assert_allclose([p for _, p, _ in unpacked(again)], [p for _, p, _ in unpacked(once)], atol=1e-9)
 
 
 def test_interpolate_between_equal_poses_stays() -> None:
     views = trajectory_views({"trajectory": "interpolate", "views": 5}, REGION, CAMERA, [TRAINING[0]] * 3)
-    assert len(views) == 5 and all(np.array_equal(p, TRAINING[0]) for _, p, _ in views)
+    assert len(views) == 5 and all(np.array_equal(p, TRAINING[0]) for _, p, _ in unpacked(views))
 
 
 def perturbed(**keys: Any) -> np.ndarray:
-    return np.array([p for _, p, _ in trajectory_views({"trajectory": "perturb", **keys}, REGION, CAMERA, TRAINING)])
+    return np.array([p for _, p, _ in unpacked(trajectory_views({"trajectory": "perturb", **keys}, REGION, CAMERA, TRAINING))])
 
 
 def test_perturb_has_the_stated_spread() -> None:
@@ -196,7 +203,7 @@ def test_training_poses_are_those_of_the_fit(tmp_path: Path) -> None:
     field = Corrected(sphere(), [RGB])
     scene = scene_of(field, tmp_path / "scene", truth=False)
     (tmp_path / "path.json").write_text(json.dumps({"trajectory": "perturb", "per_pose": 1, "rotation_deg": 0, "translation": 0}))
-    found = [pose for _, pose, _ in load_views(tmp_path / "path.json", field, scene)]  # type: ignore[arg-type]
+    found = [pose for _, pose, _ in unpacked(load_views(tmp_path / "path.json", field, scene))]  # type: ignore[arg-type]
     np.testing.assert_allclose(found, [moved(ring_pose(view, 4)) for view in range(3)], atol=1e-12)
 
 
@@ -206,9 +213,9 @@ def test_load_views(tmp_path: Path) -> None:
     path = tmp_path / "poses.json"
     path.write_text(json.dumps({"trajectory": "orbit", "views": 3}))
     views = load_views(path, field, scene)  # type: ignore[arg-type]
-    assert len(views) == 3 and views[0][0] == field.cameras["rgb"]
+    assert len(views) == 3 and views[0].camera == field.cameras["rgb"]
     path.write_text(json.dumps({"convention": "OpenCV", "rig": [ring_pose(0, 3).tolist()]}))
-    ((camera, pose, _),) = load_views(path, field)  # type: ignore[arg-type]
+    ((camera, pose, _),) = unpacked(load_views(path, field))  # type: ignore[arg-type]
     assert camera == field.cameras["rgb"] and np.allclose(pose, ring_pose(0, 3))
     path.write_text("[1]")
     with pytest.raises(InputError, match=r"poses\.json"):

@@ -11,7 +11,7 @@ import pytest
 from conftest import OPENCV_TO_OPENGL, look_at
 
 from mmsynth.scene.capture.boards import board_points
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.layouts.nerfstudio import read_nerfstudio
 from mmsynth.scene.scene import Frame
 from mmsynth.sensors.camera import Camera

@@ -10,7 +10,7 @@ import pytest
 from conftest import HEIGHT, WIDTH, frame_values, ring
 
 from mmsynth.errors import InputError
-from mmsynth.scene.images import write_png16
+from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.layouts.middlebury import read_middlebury
 from mmsynth.sensors.camera import project
 

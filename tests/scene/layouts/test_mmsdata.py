@@ -12,7 +12,8 @@ import pytest
 from conftest import HEIGHT, WIDTH, frame_values, ring
 
 from mmsynth.errors import InputError
-from mmsynth.scene.images import load_frame, write_png16
+from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.images import load_frame
 from mmsynth.scene.layouts.mmsdata import read_mmsdata
 from mmsynth.scene.scene import Frame
 from mmsynth.sensors.camera import project, unproject

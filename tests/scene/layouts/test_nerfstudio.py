@@ -14,7 +14,8 @@ import trimesh
 from conftest import HEIGHT, WIDTH, frame_values, ring
 
 from mmsynth.errors import InputError
-from mmsynth.scene.images import load_frame, write_exr, write_npz
+from mmsynth.scene.image_writers import write_exr, write_npz
+from mmsynth.scene.images import load_frame
 from mmsynth.scene.layouts.nerfstudio import read_nerfstudio
 from mmsynth.sensors.camera import project
 

@@ -6,8 +6,8 @@ import torch
 
 from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
+from mmsynth.fitting.decisions import DEGREES, Residuals, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.fitting.measurements import Batch
-from mmsynth.fitting.probe import DEGREES, Residuals, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.scene.scene import Sensor
 
 

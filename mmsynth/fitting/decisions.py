@@ -6,20 +6,38 @@ Rays of all frames are compared with what was measured. Half of them may be lear
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mmsynth.field import kernels
+from mmsynth.field import kernels, rendering
+from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.measurements import Batch
+from mmsynth.fitting.choices import Choice, switch
+from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.optimiser import Adam
+from mmsynth.fitting.recipe import RadianceRecipe
 
 DEGREES = 3  # of spherical harmonics
+_RAYS = 2048  # per modality
 _STEPS = 40
 _RATE = 4e-3
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Degree of the harmonics of each modality's radiance over directions, and whether frames have exposure factors of their own."""
+
+    view_dependence: dict[str, Choice[int]]
+    exposure: Choice[bool]
+
+    @property
+    def choices(self) -> dict[str, Choice[Any]]:
+        return {**{f"view_dependence.{name}": choice for name, choice in self.view_dependence.items()}, "exposure": self.exposure}
 
 
 @dataclass(frozen=True)
@@ -29,6 +47,46 @@ class Residuals:
     predicted: np.ndarray
     target: np.ndarray
     frame: np.ndarray
+
+
+@torch.no_grad()
+def decide(field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
+    """Put the residuals of a field as it is to the tests of this module."""
+    random = np.random.default_rng((seed, 2))
+    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random, field.device)
+    jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
+    hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+    outputs = field.shader(hits.features, batch.directions, batch.per_ray(field.view_dependence))
+    predicted = kernels.predict(outputs, hits.opacity, batch.measured)
+    if recipe.view_dependence == "auto":
+        errors = errors_by_degree(field.shader, hits.features, hits.opacity, batch)
+        degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in batch.parts}
+    else:
+        asked = recipe.view_dependence
+        degrees = dict.fromkeys(batch.parts, Choice(asked, f"degree {asked}: asked for by the recipe", asked > 0))
+    return Decisions(degrees, _exposure(predicted, batch, measurements, recipe))
+
+
+def _degree(errors: list[float], worth: float) -> Choice[int]:
+    degree, best = degree_needed(errors, worth), errors[-1]
+    grown = ", ".join(f"{e / best - 1:+.1%}" for e in errors[:-1]) if best > 0 else "nothing that could be told apart"
+    return Choice(degree, f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}", degree > 0)
+
+
+def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measurements], recipe: RadianceRecipe) -> Choice[bool]:
+    spreads, begin = {}, 0
+    usable = batch.target < batch.saturation
+    for name, (_, own) in batch.parts.items():
+        m, kept = measurements[name], usable[own]
+        of_modality = predicted[own][kept] / m.radiance_scale, batch.target[own][kept] / m.radiance_scale, batch.frame[own][kept] - begin
+        frames = len(m.origins)
+        spread, noise = exposure_spread(Residuals(*(x.cpu().numpy() for x in of_modality)), frames)
+        begin += frames
+        spreads[name] = spread if spread > 2 * noise / math.sqrt(max(frames, 1)) else 0.0
+    why = "exposure differs between frames by " + ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
+    if recipe.exposure != "auto":
+        return switch(recipe.exposure == "on", f"asked for by the recipe; {why}")
+    return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
 def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: Batch) -> dict[str, list[float]]:
@@ -47,12 +105,12 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
     usable = batch.target < batch.saturation
     out: dict[str, list[float]] = {name: [] for name in batch.parts}
     for degree in range(DEGREES + 1):
-        pupil = copy.deepcopy(shader)
-        parameters = dict(pupil.named_parameters())
+        candidate = copy.deepcopy(shader)
+        parameters = dict(candidate.named_parameters())
         optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
         for step in range(_STEPS + 1):
             with torch.enable_grad():
-                predicted = kernels.predict(pupil(features, batch.directions, degree), opacity, batch.measured)
+                predicted = kernels.predict(candidate(features, batch.directions, degree), opacity, batch.measured)
                 difference = kernels.residual(predicted, batch.measured)
                 if step < _STEPS:
                     kernels.photometric(difference * learned, batch.measured).backward()

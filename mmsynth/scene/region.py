@@ -1,0 +1,94 @@
+"""Where the cameras look: the region of interest of a scene that does not state it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mmsynth.scene.scene import Region
+from mmsynth.sensors.camera import Camera
+
+
+def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) -> Region:
+    """Guess the region of interest of a scene that does not state it.
+
+    Centre: the point nearest to all optical axes (least squares). Radius: the ball there that just fills a frame, median over
+    the cameras of distance x sin(half the larger field of view), but at most 0.9 of the distance to the nearest camera, so
+    that cameras stay outside; a stray camera nearer than 1/9 of the median does not shrink it further.
+
+    Where the axes have no common point in front of most cameras (one camera, parallel axes, looking outwards), the ball is
+    put ahead of the cameras' mean position, along their mean direction, at twice their spread (1 unit for a single
+    position), and fills a frame as above. Without a mean direction it is around the cameras' mean position: cameras that face
+    each other see it as above, a panorama is inside a ball of twice its spread.
+
+    Args:
+        cameras, poses: one per frame; poses (4, 4), OpenCV axes.
+    Returns:
+        a finite ball with positive radius, in the poses' frame and unit.
+    """
+    centres = np.stack([pose[:3, 3] for pose in poses])
+    axes = np.stack([pose[:3, 2] for pose in poses])
+    half_view = np.array([_half_view(camera) for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3): removes the part along each axis
+    normal = across.mean(0)
+    # smallest eigenvalue = mean squared sine between the axes and their common direction: 1e-4 is about half a degree
+    if np.linalg.eigvalsh(normal)[0] > 1e-4:
+        # solved about the mean position: worlds far from their origin (survey coordinates) keep their digits
+        mean = centres.mean(0)
+        point = mean + np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres - mean) / len(centres))
+        if _before(point, centres, axes):
+            return _filling(point, centres, half_view)
+    mean = centres.mean(0)
+    reach = 2 * float(np.linalg.norm(centres - mean, axis=1).max())
+    reach = reach if reach > 1e-9 * max(1.0, float(np.linalg.norm(mean))) else 1.0  # one position up to rounding
+    direction = axes.mean(0)
+    length = float(np.linalg.norm(direction))
+    if length < 0.5:
+        # cameras that face each other along one line, or a panorama
+        return _filling(mean, centres, half_view) if _before(mean, centres, axes) else Region(_triple(mean), reach)
+    return Region(_triple(mean + reach * direction / length), reach * float(np.sin(np.median(half_view))))
+
+
+def _before(point: np.ndarray, centres: np.ndarray, axes: np.ndarray) -> bool:
+    """Whether it lies in front of most cameras."""
+    return bool(np.mean(np.einsum("ni,ni->n", point - centres, axes) > 0) > 0.5)
+
+
+def _filling(point: np.ndarray, centres: np.ndarray, half_view: np.ndarray) -> Region:
+    """The ball around a point that just fills the frame of a typical camera, and leaves the cameras outside."""
+    distance = np.linalg.norm(centres - point, axis=1)
+    radius = min(float(np.median(distance * np.sin(half_view))), 0.9 * max(float(distance.min()), float(np.median(distance)) / 9))
+    return Region(_triple(point), radius)
+
+
+def region_from_points(points: np.ndarray, seen: Region, positions: np.ndarray) -> Region:
+    """A region of interest that fits what is there: the ball around the sparse points that cameras look at.
+
+    Centre: the median of the points within the region that the cameras gave. Radius: 1.1 times the distance within which 95 % of
+    them lie, and as far as the cameras' region allows: not larger than it, and cameras that were outside stay outside.
+
+    Args:
+        points: (N, 3), of structure from motion. seen: ``region_from_cameras``. positions: (M, 3) of the cameras.
+    Returns:
+        ``seen`` where fewer than 50 points lie in it.
+    """
+    centre = np.asarray(seen.centre)
+    inside = points[np.linalg.norm(points - centre, axis=1) <= seen.radius]
+    if len(inside) < 50:
+        return seen
+    middle = np.median(inside, axis=0)
+    reach = 1.1 * float(np.quantile(np.linalg.norm(inside - middle, axis=1), 0.95))
+    outside = positions[np.linalg.norm(positions - centre, axis=1) > seen.radius]
+    room = 0.9 * float(np.linalg.norm(outside - middle, axis=1).min()) if len(outside) else reach
+    radius = min(reach, seen.radius, room)
+    return Region(_triple(middle), radius) if radius > 0 else seen
+
+
+def _half_view(camera: Camera) -> float:
+    """Half the larger field of view, in radians."""
+    return float(np.arctan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
+
+
+def _triple(point: np.ndarray) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])

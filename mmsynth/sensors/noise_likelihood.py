@@ -1,0 +1,158 @@
+"""How likely values are that should be noise, and the parameters that make them most likely.
+
+Values are normal with the variance k σ²(μ) + β a² (``Parameters.variance``, k = 1, or 6 for second differences of photosites, and a² the
+expected variation around), or, with a probability that is fitted too, wider: edges and texture that nobody expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import log_ndtr
+
+QUANTISATION = 1.0 / 12.0
+
+Name = Literal["constant", "slope", "square", "variation", "outliers"]
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Logarithms of the variance's constant [DN²], of its slope K [DN], of its square PRNU² and of the share β of the expected
+    variation; logit of the probability of outliers."""
+
+    constant: float
+    slope: float
+    square: float
+    variation: float
+    outliers: float
+
+    def variance(self, mean: np.ndarray) -> np.ndarray:
+        """σ² [DN²] of values whose expectation is ``mean`` [DN] above black."""
+        constant, gain, square = np.exp([self.constant, self.slope, self.square])
+        return np.asarray(QUANTISATION + constant + gain * mean + square * mean**2)
+
+    @property
+    def outlier_probability(self) -> float:
+        return float(1.0 / (1.0 + np.exp(-self.outliers)))
+
+
+_NAMES = [f.name for f in fields(Parameters)]
+_LOW, _HIGH = Parameters(-14.0, -14.0, -20.0, -9.0, -9.0), Parameters(16.0, 10.0, 0.0, 3.0, 0.0)
+
+
+@dataclass(frozen=True)
+class OutlierVariance:
+    """Variance of what was not expected: ``times`` that of what was, and ``plus`` [DN²]."""
+
+    times: float
+    plus: float
+
+
+TEXTURE = OutlierVariance(16.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters and the covariance of them all (5, 5), 0 where they were not free."""
+
+    parameters: Parameters
+    covariance: np.ndarray
+
+    def covariance_of(self, one: Name, other: Name | None = None) -> float:
+        """Of two parameters; of one alone: its variance."""
+        return float(self.covariance[_NAMES.index(one), _NAMES.index(other or one)])
+
+
+@dataclass(frozen=True)
+class Values:
+    """What should be noise, (N,) each.
+
+    Attributes:
+        value: [DN]. foreseen: the expectation's own. mean: expected, above black.
+        activity: expected square difference of neighbours around.
+        bound: NaN, or how far from the expectation the noise went at least, where it was cut off (below: negative).
+        place: which photosites, the same in all frames. region: which part of the sensor that is, 32 x 32 photosites. frame: which.
+    """
+
+    value: np.ndarray
+    foreseen: np.ndarray
+    mean: np.ndarray
+    activity: np.ndarray
+    bound: np.ndarray
+    place: np.ndarray
+    region: np.ndarray
+    frame: np.ndarray
+
+    def __getitem__(self, chosen: np.ndarray) -> Values:
+        return Values(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+
+def outlier_variance(p: Parameters, d: Values, before: OutlierVariance) -> OutlierVariance:
+    """How wide values are that are no noise: first by those beyond six deviations, then by how likely each value is one of them."""
+    whole = ~np.isfinite(d.bound)
+    variance = p.variance(d.mean)
+    if before == TEXTURE:
+        far = whole & (d.value**2 > 36.0 * variance)
+        return OutlierVariance(1.0, float(np.mean(d.value[far] ** 2))) if far.sum() >= 10 else TEXTURE
+    unexpected = p.outlier_probability
+    narrow = np.log1p(-unexpected) + _log_density(d, variance)[0]
+    likely = 1.0 / (1.0 + np.exp(np.clip(narrow - np.log(unexpected) - _log_density(d, variance + before.plus)[0], -50.0, 50.0)))
+    return OutlierVariance(1.0, float(np.average((d.value**2 - variance)[whole], weights=likely[whole])))
+
+
+def _log_likelihood(p: Parameters, d: Values, factor: int, wide: OutlierVariance) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) and its gradient (N, 5)."""
+    constant, gain, square, share = np.exp([p.constant, p.slope, p.square, p.variation])
+    terms = np.stack([np.full_like(d.mean, factor * constant), factor * gain * d.mean, factor * square * d.mean**2, share * d.activity], 1)
+    variance = terms.sum(1) + factor * QUANTISATION
+    unexpected = p.outlier_probability
+    log_narrow, narrow_slope = _log_density(d, variance)
+    log_wide, wide_slope = _log_density(d, wide.times * variance + wide.plus)
+    explained, not_explained = np.log1p(-unexpected) + log_narrow, np.log(unexpected) + log_wide
+    both = np.logaddexp(explained, not_explained)
+    of_wide = np.exp(not_explained - both)
+    by_variance = (1.0 - of_wide) * narrow_slope + of_wide * wide.times * wide_slope
+    return both, np.concatenate([by_variance[:, None] * terms, (of_wide - unexpected)[:, None]], 1)
+
+
+def _log_density(d: Values, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of normal values, and of those that were cut off the probability of that; and its derivative by the variance."""
+    z = d.value**2 / variance
+    density, slope = -0.5 * z - 0.5 * np.log(2.0 * np.pi * variance), 0.5 * (z - 1.0) / variance
+    cut = np.flatnonzero(np.isfinite(d.bound))
+    at, v = d.bound[cut] / np.sqrt(variance[cut]), variance[cut]
+    density[cut] = log_ndtr(at)
+    slope[cut] = -0.5 * at / v * np.exp(-0.5 * at**2 - 0.5 * np.log(2.0 * np.pi) - density[cut])
+    return density, slope
+
+
+def most_likely(start: Parameters, d: Values, factor: int, free: Sequence[Name], wide: OutlierVariance = TEXTURE) -> Parameters:
+    """The parameters, from a start; what is not ``free`` stays. ``factor``: k of the values, 1 or 6."""
+    chosen = [_NAMES.index(name) for name in free]
+    with_free = lambda x: replace(start, **dict(zip(free, x, strict=True)))
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = _log_likelihood(with_free(x), d, factor, wide)
+        return -float(value.mean()), -gradient.mean(0)[chosen]
+
+    first, low, high = (np.array(astuple(p))[chosen] for p in (start, _LOW, _HIGH))
+    options = {"ftol": 1e-12, "gtol": 1e-8}
+    bounds = list(zip(low, high, strict=True))
+    found = minimize(cost, np.clip(first, low, high), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return with_free(found.x)
+
+
+def estimate_of(p: Parameters, d: Values, factor: int, free: Sequence[Name], wide: OutlierVariance = TEXTURE) -> Estimate:
+    """The most likely parameters with their covariance (sandwich estimator), regions of a frame taken as independent."""
+    chosen = [_NAMES.index(name) for name in free]
+    scores = _log_likelihood(p, d, factor, wide)[1][:, chosen]
+    _, index = np.unique(np.stack([d.region, d.frame]), axis=1, return_inverse=True)
+    per_block = np.stack([np.bincount(index, weights=s) for s in scores.T], 1)
+    inverse = np.linalg.pinv(scores.T @ scores)
+    covariance = np.zeros((5, 5))
+    covariance[np.ix_(chosen, chosen)] = inverse @ (per_block.T @ per_block) @ inverse
+    return Estimate(p, covariance)
