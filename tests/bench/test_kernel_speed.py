@@ -108,10 +108,10 @@ def test_what_is_compiled_ahead_is_all_that_runs(capsys: pytest.CaptureFixture[s
     warm_up()
     assert cpu.is_compiled()
     state = torch.get_rng_state()
-    before = [list(k.signatures) for k in cpu._KERNELS]
+    before = [list(k.signatures) for k in cpu.KERNELS]
     warm_up.__wrapped__()
     assert capsys.readouterr().err == "" and torch.equal(torch.get_rng_state(), state)
     for operation in OPERATIONS:
         if "numba" in operation.calls:
             time_operation(operation, {"torch": "cpu", "numba": "cpu"}, 300, 1.0)
-    assert [list(k.signatures) for k in cpu._KERNELS] == before and all(len(s) == 1 for s in before)
+    assert [list(k.signatures) for k in cpu.KERNELS] == before and all(len(s) == 1 for s in before)

@@ -129,7 +129,7 @@ def test_the_reference_is_what_the_kernel_nears_and_is_not_cut_off(field: Field,
     finally:
         field.sampling = fused
     assert truth.samples < 96 and difference(found, truth.outputs, list(SENSORS))["error"] < 1e-4
-    long = replace(fused, step=fused.step / 8)
+    long = fused._replace(step=fused.step / 8)
     field.sampling = long
     try:
         assert truth_of(field, rays).samples > truth.samples

@@ -37,7 +37,7 @@ def _field(background: bool, region: Region | None = None) -> Field:
     with torch.no_grad():
         field.surface.output_weight.normal_(0, 0.05)
         field.appearance.table.normal_()
-    field.sampling = replace(field.sampling, sharpness=400.0, step=0.005)
+    field.sampling = field.sampling._replace(sharpness=400.0, step=0.005)
     return field
 
 
@@ -57,7 +57,7 @@ def test_normals_are_those_of_the_surface_that_is_seen(background: bool) -> None
     points = (origins + directions * out["depth"][:, None])[hit].double().requires_grad_()
     field.double()
     place = kernels.contract(points) if background else points
-    value = field.surface.reference(place, field.sampling.active_surface)
+    value = kernels.reference.surface_value(place, *field.surface.at(field.sampling.active_surface))
     apart = value.detach().abs()  # the depth is where the surface is; where a ray grazes it, within the soft part
     assert float(apart.quantile(0.95)) < 0.1 * field.sampling.step and float(apart.max()) < 3.5 / field.sampling.sharpness
     (slope,) = torch.autograd.grad(value.sum(), points)

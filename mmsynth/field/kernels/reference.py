@@ -41,7 +41,7 @@ from mmsynth.sensors.polarization import coherency_from_factor
 
 Encoding = Callable[[Tensor, Tensor, Tensor, Tensor, int], Tensor]  # see ``hash_encode``
 Weighing = Callable[[Tensor, float, Tensor], tuple[Tensor, Tensor]]  # see ``section_weights``
-_HARMONIC_DEGREES = torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7)
+HARMONIC_DEGREES = torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7)
 
 
 def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
@@ -308,7 +308,7 @@ def spherical_harmonics(d: Tensor) -> Tensor:
 
 def hidden_layers(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees: Tensor | int) -> Tensor:
     """The last hidden layer of the shader, (R, H), which all modalities share."""
-    seen = _HARMONIC_DEGREES.to(features.device) <= (degrees if isinstance(degrees, int) else degrees[:, None])
+    seen = HARMONIC_DEGREES.to(features.device) <= (degrees if isinstance(degrees, int) else degrees[:, None])
     inputs = torch.cat([features, spherical_harmonics(directions) * seen], -1)
     return torch.relu(linear(torch.relu(linear(inputs, weights.first, weights.first_bias)), weights.second, weights.second_bias))
 
