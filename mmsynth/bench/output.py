@@ -1,4 +1,4 @@
-"""What a bench leaves behind: ``results.json``, ``report.md`` and ``plot.svg``, each written whole or not at all."""
+"""The files of a benchmark: ``results.json``, ``report.md`` and ``plot.svg``, each written whole or not at all."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at
-    scores = evaluate(field, load_scene(task["scene"]), scene.split.test)
+    scores = evaluate(field, load_scene(task["scene"]), views=scene.split.test)
     return {
         "seconds": seconds,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),

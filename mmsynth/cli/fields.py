@@ -26,7 +26,7 @@ from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
-    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.dataset.plan import DatasetFormat
     from mmsynth.operations.views.load import Rig
 
 
@@ -52,12 +52,12 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="every choice that was made for the scene, and why")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Learn the field of a scene."""
     from mmsynth.fitting.choices import Choice, choices_of, summary
     from mmsynth.fitting.device import pick_device
-    from mmsynth.fitting.needs import Needs
     from mmsynth.fitting.trainer import FitProgress
     from mmsynth.report.text import fit_text
     from mmsynth.scene.load import load_scene
@@ -78,16 +78,13 @@ def fit(
         told: set[str] = set()
 
         def explain(choices: dict[str, Choice[Any]]) -> None:
-            for line in summary({name: choice for name, choice in choices.items() if name not in told}, verbose=True):
-                say(f"needs {line}")
+            for line in summary({name: choice for name, choice in choices.items() if name not in told}, verbose):
+                say(line)
             told.update(choices)
-
-        def on_start(needs: Needs) -> None:
-            explain(needs.choices)
 
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
-            on_start=on_start, on_step=on_step,
+            on_start=lambda needs: explain(needs.choices), on_step=on_step,
         )  # fmt: skip
         explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
     print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))

@@ -14,7 +14,7 @@ from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
     from mmsynth.operations.conversion.methods import Method
-    from mmsynth.operations.dataset.generate import DatasetFormat
+    from mmsynth.operations.dataset.plan import DatasetFormat
     from mmsynth.operations.output.records import RecordFormat
     from mmsynth.operations.simulation.simulate import FrameFormat, Split
     from mmsynth.operations.views.load import Rig

@@ -217,6 +217,7 @@ _RUN_FACTS = ("mmsynth", "seed", "steps", "seconds", "rays_per_s", "samples_per_
 def write_run_report(
     run_dir: Path | str,
     field: Field,
+    *,
     evaluation: Mapping[str, Any] | None = None,
     train_log: Path | Sequence[Mapping[str, Any]] | None = None,
     scene: Scene | None = None,

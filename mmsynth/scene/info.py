@@ -1,4 +1,4 @@
-"""What is in a scene, for people and for programs."""
+"""A summary of a scene: ``describe`` as JSON, ``render_text`` as text."""
 
 from __future__ import annotations
 

@@ -186,7 +186,7 @@ def ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray) -> np.ndarray:
-    """Points that pixels see: depth along the ray (H, W) → (H, W, 3) float64, world frame, NaN where the depth is."""
+    """Points that pixels see: depth along the ray (H, W) → (H, W, 3) float64, world, NaN where the depth is (kornia's is for pinholes)."""
     directions = ray_map(camera)[0] @ camera_to_world[:3, :3].T
     return camera_to_world[:3, 3] + directions * depth_ray[..., None].astype(np.float64)
 

@@ -48,7 +48,8 @@ def demosaic(raw: Tensor, pattern: np.ndarray, offset: tuple[int, int] = (0, 0))
 
     For previews, comparisons and training on demosaicked images only: it invents two thirds and more of what it returns, and a raw
     frame is never demosaicked to be trained on. Each channel is the tent-weighted mean of its own photosites (Knutsson and Westin
-    1993), measured values kept as they are; bilinear for a Bayer pattern. NaN where a channel was never measured.
+    1993), measured values kept as they are; bilinear for a Bayer pattern (kornia's is for
+    Bayer alone, and equal but at the border). NaN where a channel was never measured.
     """
     height, width = raw.shape[-2:]
     present = mosaic_mask(pattern, height, width, offset).to(raw.device)

@@ -4,7 +4,7 @@
 
 Two ways. ``photon_transfer`` trusts the expectation (a flat field, the truth of a rendered scene): the noise is raw - expected.
 ``photon_transfer_of_frames`` does not: what a fitted field expects is off by as much as the noise. It takes differences between
-neighbouring photosites of one channel, and of the expectation only how bright it is there and how much it varies.
+neighbouring photosites of one channel, and uses the expectation only for the local brightness and its variation.
 
 Both are maximum likelihood, see ``noise_likelihood``.
 """
@@ -41,10 +41,10 @@ _START = Parameters(constant=float(np.log(4.0)), slope=0.0, square=-12.0, variat
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """What the variance of raw values tells of a sensor; each figure with its standard deviation.
+    """Noise figures of a sensor from the variance of its raw values, each with its standard deviation.
 
-    A read noise or PRNU that is not told (no dark pixels, no pattern) is 0, and its deviation is what would have been seen at twice, for
-    PRNU thrice, the deviation of its square.
+    A read noise or PRNU that cannot be measured (no dark pixels, no pattern) is 0. Its deviation is then the detection limit: the value
+    whose square is two (PRNU: three) deviations of the square.
 
     Attributes:
         gain_dn_e: K [DN / e-]. read_e: σ_d [e-], of all that does not depend on light. prnu: share. mean_dn, variance_dn2: the curve
@@ -64,7 +64,7 @@ class PhotonTransfer:
 def photon_transfer(raw: np.ndarray, expected: np.ndarray, bits: int, black_dn: float = 0.0, seed: int = 0) -> PhotonTransfer:
     """Fit the photon transfer equation to raw values and what they are expected to be.
 
-    A value at an end of the converter says "at most" or "at least".
+    A value at an end of the converter is taken as censored: "at most" or "at least".
 
     Args:
         raw: (N,) DN. expected: (N,) DN, black level included. bits: of the converter. seed: of the choice among more than 400,000.
@@ -106,13 +106,15 @@ def photon_transfer_of_frames(
     differences at one place have in common in several frames, E[d_i d_j] = 6 PRNU² μ_i μ_j, where that is more than three times its
     deviation.
 
-    Texture that the model does not see counts as noise, the more the less plain a surface is, and plain ones are few: of surfaces plain
-    to five degrees those are taken whose gain deviates least, all told. That is by blocks of 32 x 32 photosites (sandwich estimator:
-    differences share photosites, and what is wrong in one place is wrong around it), by what the next less plain surfaces say
-    differently, and 2.5 % for each degree. Texture as fine as photosites still leads off: where all that is bright has it, the gain is
-    too large, by up to a sixth, and the read noise too small, by up to two fifths, and the deviations do not tell. Frames that were
-    rendered from another field have such grain everywhere: gains 1.1 to 2 times too large. The read noise is told where it is a good
-    part of the noise: by frames of short exposure.
+    Texture that the model does not have counts as noise, so smooth places are preferred. There are five degrees of smoothness; the one
+    is taken whose gain has the least total deviation. That has three parts: the sandwich estimator over blocks of 32 x 32 photosites
+    (differences share photosites, and errors of the model are local), the difference to the estimate at the next degree, and 2.5 % for
+    each degree.
+
+    Limits: texture as fine as photosites is not told from noise. Where all bright places have it, the gain is up to a sixth too large and
+    the read noise up to two fifths too small, and the deviations do not show it. Frames that were rendered from another field have such
+    grain everywhere: their gains come out 1.1 to 2 times too large. Read noise can only be measured where it is a good part of the noise,
+    in frames of short exposure.
 
     Args:
         frames: raw (H, W) and expected (H, W, C), all channels at every pixel, DN, black level included; NaN where unknown.

@@ -13,7 +13,8 @@ from mmsynth.field.field import Field
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
-from mmsynth.operations.dataset.generate import DatasetFormat, generate_dataset
+from mmsynth.operations.dataset.generate import generate_dataset
+from mmsynth.operations.dataset.plan import DatasetFormat
 from mmsynth.operations.output.work_partition import WorkPartition, local_device
 from mmsynth.operations.views.load import Rig
 from mmsynth.report.report import write_run_report

@@ -63,5 +63,5 @@ def evaluate_run(run: Run, *, progress: Progress | None = None) -> dict[str, Any
         InputError: as ``evaluate``.
     """
     scores = evaluate(run.field, run.scene, progress=progress)
-    write_run_report(run.folder, run.field, scores, scene=run.scene)
+    write_run_report(run.folder, run.field, evaluation=scores, scene=run.scene)
     return scores

@@ -28,7 +28,7 @@ def test_report(tmp_path: Path) -> None:
     }
     log = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
     evaluation = evaluate(field, scene)  # type: ignore[arg-type]
-    page = write_run_report(tmp_path, field, evaluation, log, scene).read_text()  # type: ignore[arg-type]
+    page = write_run_report(tmp_path, field, evaluation=evaluation, train_log=log, scene=scene).read_text()  # type: ignore[arg-type]
     assert page.count("data:image/png;base64,") == 3 * 4 + 2 + 3  # frame, rendering, difference; polarization; geometry
     assert (tmp_path / "preview.png").is_file()
     assert "&lt;nothing&gt;" in page and "<nothing>" not in page

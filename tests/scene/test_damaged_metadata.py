@@ -28,7 +28,7 @@ from mmsynth.sensors.sensor_file import load_sensor
 # what is too long or too deep for Python's own JSON writer, put in afterwards
 _DIGITS, _NESTED = "<digits>", "<nested>"
 _VALUES: tuple[Any, ...] = (
-    None, True, False, "", "x", "nan", "../..", "a\0b", "\ud800", "é" * 300, "x" * 5000, "1" * 31, _DIGITS, _NESTED,
+    None, True, False, "", "x", "nan", "../..", "transforms.json", "a\0b", "\ud800", "é" * 300, "x" * 5000, "1" * 31, _DIGITS, _NESTED,
     0, 1, -1, 2, 0.5, -0.5, 1e-300, 1e9, -1e9, 1e155, 1e300, float("nan"), float("inf"), -float("inf"),
     10**9, 10**12, 2**31, 2**63, 2**64, 10**31, -(10**31), 10**400, 12345678901234567890123456789.5,
     [], {}, [[]], [None], [{}], {"x": 1}, [0], [1, 2, 3], ["a"], [None] * 4, [[None] * 4] * 4, [[10**31] * 4] * 3, [[10**400] * 4] * 4,
@@ -105,13 +105,13 @@ def _damaged_text(text: str, dice: random.Random) -> bytes:
         elif way == 2:
             del tokens[dice.randrange(len(tokens))]
         elif way == 3:
-            tokens.append(str(dice.choice(_VALUES[:36])))
+            tokens.append(str(dice.choice(_VALUES[:37])))
         elif way == 4:
             return "\n".join(lines).encode(errors="surrogatepass")[: dice.randrange(len(text) + 1)]
         elif way == 5:
             tokens[dice.randrange(len(tokens))] = "9" * 5000
         else:
-            tokens[dice.randrange(len(tokens))] = str(dice.choice(_VALUES[:36]))
+            tokens[dice.randrange(len(tokens))] = str(dice.choice(_VALUES[:37]))
         if way not in (0, 1):
             lines[row] = " ".join(tokens)
     damaged = "\n".join(lines).encode(errors="surrogatepass")

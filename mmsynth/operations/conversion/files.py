@@ -125,7 +125,7 @@ def _registered(field: Field, scene: Scene, source: str, images: Sequence[Path])
     items = []
     for path in images:
         frame = Frame(source, 0, path, camera, np.eye(4))
-        at = register(field, known, load_frame(field.sensors[source], frame)[0], camera, source, str(path))
+        at = register(field, known, load_frame(field.sensors[source], frame)[0], camera, source, name=str(path))
         facts = {"covariance": at.covariance.tolist(), "sd_px": at.sd_px, "inliers": at.inliers, "residual": at.residual}
         items.append(_Item(path.stem, PosedCamera(camera, at.pose), frame, registration=facts))
     return items

@@ -36,7 +36,7 @@ _UNEXPLAINED = 0.35  # relative residual colour, or a gain beyond (1 + _UNEXPLAI
 
 @dataclass(frozen=True)
 class Guide:
-    """A frame against its rendering (H, W).
+    """A measured frame compared with its rendering (H, W).
 
     Attributes:
         exposure: factor of the whole frame. gain: (H, W), 1 = as rendered. gain_sd: its posterior standard deviation.

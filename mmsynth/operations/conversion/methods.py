@@ -49,7 +49,7 @@ class Converted:
         method: the one used. values: (H, W, K) float32, NaN where the lens has no ray. stokes: (H, W, 3) of a polarization target.
         confidence: (H, W) float32 in [0, 1]: exp(-½ (σ / 0.1)²) with σ the relative standard deviation of the gain, 0 where the lens has no
             ray or the frame shows what the field does not have; of ``render_frame``, coverage.
-        guided: (H, W) bool, where the frame had a say.
+        guided: (H, W) bool, where the frame contributed.
         exposure: of the source frame, in units of the frames that the field learned from. opacity, valid: of the rendering.
     """
 

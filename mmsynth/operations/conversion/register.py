@@ -77,7 +77,7 @@ class Registered:
     residual: float
 
 
-def landmarks(field: Field, scene: Scene, source: str, progress: Progress | None = None) -> Landmarks:
+def landmarks(field: Field, scene: Scene, source: str, *, progress: Progress | None = None) -> Landmarks:
     """Features and markers of the training frames of a sensor, on the field's surface; once for any number of frames to register."""
     sensor = field.sensors[source]
     frames = [replace(frame, camera_to_world=field.pose_of(frame)) for frame in scene.frames_of(source, scene.split.train)]
@@ -94,7 +94,7 @@ def landmarks(field: Field, scene: Scene, source: str, progress: Progress | None
     return Landmarks(out, board_corners(frames, lambda frame: _grey(load_frame(sensor, frame)[0], sensor)))
 
 
-def register(field: Field, known: Landmarks, raw: np.ndarray, camera: Camera, source: str, name: str = "frame") -> Registered:
+def register(field: Field, known: Landmarks, raw: np.ndarray, camera: Camera, source: str, *, name: str = "frame") -> Registered:
     """Find the pose of one frame.
 
     Args:

@@ -24,25 +24,22 @@ stated hashes is not rendered again. The same field and request give the same by
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import sha256_of, write_json
-from mmsynth.operations.dataset.index import PER_SHARD, drop_views, finished_shard, finished_view, pack_shard, shard_name, view_folder
+from mmsynth.operations.dataset.index import PER_SHARD, finished_view, pack_shard, shard_name, view_folder
+from mmsynth.operations.dataset.plan import DatasetFormat, Plan, check_request, meta_of, plan_dataset
 from mmsynth.operations.output.previews import preview_linear
 from mmsynth.operations.output.progress import Counter, Progress, RaysDone
 from mmsynth.operations.output.records import (
     UNITS,
     RecordFormat,
-    field_hash,
     modality_arrays,
     read_record,
     write_record,
@@ -51,23 +48,13 @@ from mmsynth.operations.output.work_partition import WorkPartition
 from mmsynth.operations.simulation.simulate import simulate
 from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, training_rays, view_scores
 from mmsynth.operations.views.flow import optical_flow
-from mmsynth.operations.views.load import RIGS, Rig, load_views, on_the_rig
+from mmsynth.operations.views.load import Rig, load_views
 from mmsynth.scene.image_writers import write_png16
-from mmsynth.scene.layouts.mmsdata import meta_content
 from mmsynth.scene.layouts.nerfstudio import transforms_content
-from mmsynth.scene.scene import PosedCamera, Scene, canonical_modality
-from mmsynth.scene.serialisation import CONVENTIONS, channels_to_json, posed_to_json
-from mmsynth.version import __version__
+from mmsynth.scene.scene import PosedCamera, Scene
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field, Rendering
-
-DatasetFormat = Literal[RecordFormat, "webdataset", "mms-data"]
-DATASET_FORMATS: tuple[DatasetFormat, ...] = get_args(DatasetFormat)
-OUTPUTS = ("geometry", "flow", "coverage")
-LAYOUT = 2
-
-Placed = dict[str, PosedCamera]  # of each modality at one view
 
 
 @dataclass(frozen=True)
@@ -122,7 +109,7 @@ def generate_dataset(
     """
     if min_coverage is not None and not 0.0 <= min_coverage <= 1.0:
         raise InputError(f"--min-coverage {min_coverage:g}: expected a number from 0 to 1.")
-    names, wanted = _checked(field, modalities, rig, file_format, outputs)
+    names, wanted = check_request(field, modalities, rig, file_format, outputs)
     views = load_views(views, field, scene)
     if not views:
         raise InputError("dataset: no views, expected at least one.")
@@ -132,8 +119,8 @@ def generate_dataset(
         raise InputError("dataset: coverage needs the rays of the training frames, expected the scene.")
     left_out: list[tuple[str, float]] = []
     if min_coverage is not None and rays is not None:
-        views, left_out = covered_views(views, view_scores(field, rays, views, progress), min_coverage)
-    plan = _planned(field, views, Path(out), names, rig, file_format, wanted, rays)
+        views, left_out = covered_views(views, view_scores(field, rays, views, progress=progress), min_coverage)
+    plan = plan_dataset(field, views, Path(out), names, rig, file_format, wanted, rays)
     part = part or WorkPartition()
     _write_views(plan, part, progress)
     raw = simulate(field, sensors, plan.out / "raw", views=views, rig=rig, seed=seed, part=part, progress=progress) if sensors else None
@@ -141,7 +128,7 @@ def generate_dataset(
     return GeneratedDataset(path, len(views), tuple(left_out))
 
 
-def _write_views(plan: _Plan, part: WorkPartition, progress: Progress | None) -> None:
+def _write_views(plan: Plan, part: WorkPartition, progress: Progress | None) -> None:
     """Render and write the views of this process that are not there yet, and pack them, where the format says so."""
     packed = plan.format == "webdataset"
     mine = part.of(len(plan.placed), PER_SHARD if packed else 1)
@@ -165,116 +152,12 @@ def _write_views(plan: _Plan, part: WorkPartition, progress: Progress | None) ->
                 plan.shard(index)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What is to be made. keys: hash of everything that decides a view's files; it, placed (cameras) and stated by view. shards: finished
-    ones, by name."""
-
-    field: Field
-    out: Path
-    rig: Rig
-    format: DatasetFormat
-    outputs: tuple[str, ...]
-    rays: TrainingRays | None
-    request: dict[str, Any]
-    groups: list[list[str]]
-    placed: list[Placed]
-    stated: list[dict[str, Any]]
-    keys: list[str]
-    shards: dict[str, list[dict[str, Any]]]
-
-    def finished(self, index: int) -> dict[str, Any] | None:
-        """What the sidecar of a finished view says, be it in a folder or in a shard."""
-        if self.format == "webdataset":
-            shard = self.shard(index)
-            if shard is not None:
-                return shard[index % PER_SHARD]
-        return finished_view(self.out, index, self.keys[index])
-
-    def shard(self, index: int) -> list[dict[str, Any]] | None:
-        name, first = shard_name(index), index // PER_SHARD * PER_SHARD
-        if name not in self.shards:
-            made = finished_shard(self.out, name, self.keys[first : first + PER_SHARD])
-            if made is None:
-                return None
-            self.shards[name] = made
-            drop_views(self.out, range(first, first + len(made)))  # left over where a run was cut off
-        return self.shards[name]
-
-
-def _checked(
-    field: Field, modalities: Sequence[str] | None, rig: Rig, file_format: DatasetFormat, outputs: Sequence[str] | None
-) -> tuple[list[str], tuple[str, ...]]:
-    """Canonical names of the modalities, and the outputs in their order; what cannot be made is said before anything is rendered."""
-    if rig not in RIGS:
-        raise InputError(f"dataset: rig is {rig!r}, expected one of {', '.join(RIGS)}.")
-    if file_format not in DATASET_FORMATS:
-        raise InputError(f"dataset: format is {file_format!r}, expected one of {', '.join(DATASET_FORMATS)}.")
-    names = field.check_modalities(None if modalities is None else [canonical_modality(m) for m in modalities])
-    if not names:
-        raise InputError("dataset: no modalities, expected at least one.")
-    unknown = [o for o in outputs or () if o not in OUTPUTS]
-    if unknown:
-        raise InputError(f"dataset: output {unknown[0]!r}, expected some of {', '.join(OUTPUTS)}.")
-    return names, tuple(o for o in OUTPUTS if outputs is None or o in outputs)
-
-
-def _planned(
-    field: Field,
-    views: Sequence[PosedCamera],
-    out: Path,
-    names: Sequence[str],
-    rig: Rig,
-    file_format: DatasetFormat,
-    wanted: tuple[str, ...],
-    rays: TrainingRays | None,
-) -> _Plan:
-    wanted = tuple(o for o in wanted if o != "coverage" or rays is not None)
-    placed = [_place(field, names, view, rig) for view in views]
-    if file_format == "mms-data":
-        _meta(field, out, names, placed)  # what it does not hold is said before anything is rendered
-    fit = {key: field.manifest.get(key) for key in ("recipe", "seed", "scene", "steps")}
-    request = {
-        "layout": LAYOUT,
-        "field": field_hash(field),
-        "fit": fit,
-        "rig": rig,
-        "format": file_format,
-        "outputs": list(wanted),
-        "modalities": {name: channels_to_json(field.sensors[name]) for name in names},
-        "unit": field.unit,
-        "conventions": CONVENTIONS,
-        "versions": {"mmsynth": __version__} | {package: version(package) for package in ("numpy", "torch")},
-    }
-    stated = [
-        {"name": view.name, "cameras": {m: posed_to_json(seen_by) for m, seen_by in cameras.items()}}
-        for view, cameras in zip(views, placed, strict=True)
-    ]
-    request_text = json.dumps(request, sort_keys=True)
-    seen_from = None if rays is None or "coverage" not in wanted else hashlib.sha256(rays.poses.tobytes()).hexdigest()
-    # the flow of a view depends on where the next one is
-    following = [view["cameras"] if "flow" in wanted else None for view in stated[1:]] + [None]
-    keys = [
-        hashlib.sha256(json.dumps([request_text, seen_from, view, after], sort_keys=True).encode()).hexdigest()
-        for view, after in zip(stated, following, strict=True)
-    ]
-    groups = [list(names)] if rig == "aligned" else [[name] for name in names]
-    return _Plan(field, out, rig, file_format, wanted, rays, request, groups, placed, stated, keys, {})
-
-
-def _place(field: Field, names: Sequence[str], view: PosedCamera, rig: Rig) -> Placed:
-    """Camera and pose of each modality at one view."""
-    reference = next(iter(field.sensors))
-    own = lambda name: rig == "aligned" or name == reference
-    return {name: view if own(name) else on_the_rig(field, view, reference, name) for name in names}
-
-
 def _of(stem: str, modality: str, rig: Rig) -> str:
     """File stem: on the native rig, one per modality."""
     return stem if rig == "aligned" else f"{stem}_{modality}"
 
 
-def _render(plan: _Plan, index: int, progress: RaysDone | None, modalities: bool = True) -> list[Rendering]:
+def _render(plan: Plan, index: int, progress: RaysDone | None, modalities: bool = True) -> list[Rendering]:
     """Each group of modalities of a view, or its geometry alone."""
     geometry = bool(plan.outputs)
     out = []
@@ -284,7 +167,7 @@ def _render(plan: _Plan, index: int, progress: RaysDone | None, modalities: bool
     return out
 
 
-def _following(plan: _Plan, index: int, mine: bool, ahead: dict[int, list[Rendering]], progress: RaysDone) -> list[np.ndarray] | None:
+def _following(plan: Plan, index: int, mine: bool, ahead: dict[int, list[Rendering]], progress: RaysDone) -> list[np.ndarray] | None:
     """depth_ray of the next view, by group: rendered now and kept, where it is still to be made, else read from what was made."""
     if "flow" not in plan.outputs or index + 1 == len(plan.placed):
         return None
@@ -300,7 +183,7 @@ def _following(plan: _Plan, index: int, mine: bool, ahead: dict[int, list[Render
     return [rendering.depth_ray for rendering in _render(plan, index + 1, None, modalities=False)]
 
 
-def _write_view(plan: _Plan, index: int, renderings: Sequence[Rendering], following: Sequence[np.ndarray] | None) -> None:
+def _write_view(plan: Plan, index: int, renderings: Sequence[Rendering], following: Sequence[np.ndarray] | None) -> None:
     """Write the files of one view. The sidecar goes first, so that it never vouches for new files, and comes last."""
     folder = plan.out / view_folder(index)
     (folder / "view.json").unlink(missing_ok=True)
@@ -339,7 +222,7 @@ def _write_view(plan: _Plan, index: int, renderings: Sequence[Rendering], follow
     write_json(folder / "view.json", {"request": plan.keys[index], **plan.stated[index], **score, "files": files})
 
 
-def _write_modality(plan: _Plan, index: int, name: str, rendering: Rendering, record_format: RecordFormat) -> dict[str, Any]:
+def _write_modality(plan: Plan, index: int, name: str, rendering: Rendering, record_format: RecordFormat) -> dict[str, Any]:
     sensor, folder = plan.field.sensors[name], plan.out / view_folder(index)
     arrays = modality_arrays(rendering.channels[name], rendering.stokes.get(name))
     if plan.format != "mms-data":
@@ -361,7 +244,7 @@ def _geometry_arrays(rendering: Rendering, pose: np.ndarray) -> dict[str, np.nda
     }
 
 
-def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
+def _summary(plan: Plan, raw: Path | None, seed: int) -> Path | None:
     """Write what stands above the views, once all of them are there; raw: the meta_data.json of their raw frames, seed: of their noise."""
     out, views = plan.out, []
     shards: dict[str, dict[str, Any]] = {}
@@ -385,7 +268,7 @@ def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
         write_json(files[-1], transforms_content(pictures))
     if plan.format == "mms-data":
         files.append(out / "meta_data.json")
-        write_json(files[-1], _meta(plan.field, out, list(plan.request["modalities"]), plan.placed))
+        write_json(files[-1], meta_of(plan.field, out, list(plan.request["modalities"]), plan.placed))
     if raw is not None:
         files += [raw, *(path for kind in ("modalities", "sensors", "sidecars") for path in sorted((raw.parent / kind).rglob("[!.]*.*")))]
     listed = {str(path.relative_to(out)): {"sha256": sha256_of(path), "bytes": path.stat().st_size} for path in files}
@@ -394,10 +277,3 @@ def _summary(plan: _Plan, raw: Path | None, seed: int) -> Path | None:
         {**plan.request, "files": listed} | ({"raw_seed": seed} if raw else {}) | ({"shards": shards} if shards else {}) | {"views": views},
     )
     return out / "dataset.json"
-
-
-def _meta(field: Field, out: Path, names: Sequence[str], placed: Sequence[Placed]) -> dict[str, Any]:
-    """meta_data.json of a scene whose frames have all channels at every pixel."""
-    sensors = [replace(field.sensors[name], mosaic=None) for name in names]
-    frames = {name: {i: replace(cameras[name], name=f"{i:04d}.tiff") for i, cameras in enumerate(placed)} for name in names}
-    return meta_content(out, sensors, frames, field.region, field.unit)

@@ -1,4 +1,4 @@
-"""What of a dataset is on disk, and whether it is as stated: views, shards, ``dataset.json``."""
+"""Which parts of a dataset are on disk and intact: views, shards, ``dataset.json``."""
 
 from __future__ import annotations
 

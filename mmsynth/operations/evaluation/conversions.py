@@ -1,4 +1,4 @@
-"""How good a conversion is: every method beside the baselines that need no field, on test views.
+"""Scores of conversions on test views: every method, and baselines.
 
 Truth, in this order: noise-free light of the target at the source's own pose (``gt/aligned``), noise-free light at the target's own pose
 (``gt/<modality>``), else the target's raw test frame. In the last two the conversion is made as the target sensor.
@@ -57,7 +57,7 @@ def evaluate_conversions(
 
 
 def evaluate_conversion(
-    field: Field, scene: Scene, source: str, target: str, views: Sequence[int] | None = None, progress: Progress | None = None
+    field: Field, scene: Scene, source: str, target: str, *, views: Sequence[int] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Score all methods and baselines of one pair.
 

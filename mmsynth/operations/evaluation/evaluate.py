@@ -48,6 +48,113 @@ if TYPE_CHECKING:
 _FOREGROUND_SOURCES = ("masks", "gt", "opacity")
 
 
+def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, progress: Progress | None = None) -> dict[str, Any]:
+    """Score a field on test views (definitions: module docstring).
+
+    Args:
+        views: view ids; None: the scene's test views. progress: called with (rays done, rays in all).
+    Returns:
+        ``{"modalities": {name: {"psnr", "psnr_foreground", "foreground_from", "ssim", "psnr_truth", ...}}, "geometry": {...},
+        "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON.
+    Raises:
+        InputError: no frame of these views, or a file that cannot be read.
+    """
+    began = time.perf_counter()
+    chosen = tuple(scene.split.test) if views is None else tuple(views)
+    frames = _frames_of(field, scene, chosen, named=views is not None)
+    truth = GroundTruth(scene)
+    # the pose of gt/aligned and gt/geometry
+    at_rgb = [f for f in scene.frames_of("rgb", chosen) if truth.aligned(f.view) or truth.geometry(f.view)]
+    count = Counter(progress, sum(frame.camera.width * frame.camera.height for frame in (*frames, *at_rgb)))
+    exam = _Exam(field, scene, truth, count)
+    for frame in frames:
+        _at_own_pose(exam, frame)
+    for frame in at_rgb:
+        _at_rgb_pose(exam, frame)
+    return {
+        "modalities": {name: _summary(exam.scores[name], exam.own_pose[name]) for name in exam.scores if exam.scores[name].means},
+        "geometry": _values(exam.geometry, ("depth_mae", "normal_mae_deg", "hit_rate")) | _chamfer(exam.points, exam.true_points),
+        "views": sorted({frame.view for frame in frames}),
+        "seconds": {"render": exam.seconds, "total": time.perf_counter() - began},
+        "rays_per_s": exam.rays / max(exam.seconds, 1e-9),
+    }
+
+
+def _frames_of(field: Field, scene: Scene, chosen: tuple[int, ...], named: bool) -> list[Frame]:
+    """Of all modalities that field and scene share; views that somebody named must all be there."""
+    frames = [frame for name in field.sensors if name in scene.sensors for frame in scene.frames_of(name, chosen)]
+    missing = sorted(set(chosen) - {frame.view for frame in frames})
+    if not frames or (named and missing):
+        what = f"view {missing[0]}" if missing else "test views"
+        raise InputError(f"{scene.root}: no frames of {what} for any of {', '.join(field.sensors)}, expected view ids of the scene.")
+    return frames
+
+
+class _Exam:
+    """What is asked, and what was scored so far."""
+
+    def __init__(self, field: Field, scene: Scene, truth: GroundTruth, count: Counter) -> None:
+        self.field, self.truth, self.count, self.metric = field, truth, count, scene.unit == "m"
+        names = [name for name in field.sensors if name in scene.sensors]
+        self.scores = {name: _Scores() for name in names}
+        self.own_pose = {name: _Scores() for name in names}
+        self.geometry = _Scores()
+        self.points: list[np.ndarray] = []
+        self.true_points: list[np.ndarray] = []
+        self.rays, self.seconds = 0, 0.0
+
+    def render(self, frame: Frame, names: Sequence[str], geometry: bool) -> Rendering:
+        started = time.perf_counter()
+        found = self.field.render(frame.camera, self.field.pose_of(frame), names, geometry=geometry, progress=self.count)
+        self.seconds += time.perf_counter() - started
+        self.rays += int(found.valid.sum())
+        return found
+
+
+def _at_own_pose(exam: _Exam, frame: Frame) -> None:
+    """A frame's sensor against the frame, and against noise-free light at its pose."""
+    sensor, scores = exam.field.sensors[frame.sensor], exam.scores[frame.sensor]
+    rendering = exam.render(frame, [sensor.name], False)
+    size = rendering.valid.shape
+    region = _checked(exam.truth.region(frame), size, f"gt/masks, {sensor.name} view {frame.view}")
+    _score_raw(scores, sensor, frame, rendering, region)
+    light = _checked(exam.truth.image(frame), (*size, _components(sensor)), f"gt, {sensor.name} view {frame.view}")
+    if light is None:
+        return
+    everywhere = np.ones(size, bool)
+    _score_truth(scores, "psnr_truth_full", sensor, rendering, light, everywhere)
+    if region is not None:
+        _score_truth(scores, "psnr_truth", sensor, rendering, light, region)
+    _score_light(exam.own_pose[sensor.name], sensor, rendering, light, everywhere if region is None else region)
+
+
+def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
+    """All sensors, and the geometry, at the pose of an RGB frame."""
+    aligned = {name: light for name, light in exam.truth.aligned(frame.view).items() if name in exam.scores}
+    shape = exam.truth.geometry(frame.view) or {}
+    rendering = exam.render(frame, list(aligned), bool(shape))
+    size = rendering.valid.shape
+    region = shape["in_roi"].astype(bool) if "in_roi" in shape else exam.truth.region(frame)
+    region = _checked(region, size, f"gt region, view {frame.view}")
+    where = np.ones(size, bool) if region is None else region
+    for name, light in aligned.items():
+        sensor = exam.field.sensors[name]
+        _checked(light, (*size, _components(sensor)), f"gt/aligned, {name} view {frame.view}")
+        _score_truth(exam.scores[name], "psnr_aligned", sensor, rendering, light, where)
+        _score_light(exam.scores[name], sensor, rendering, light, where)
+    if "depth_z" in shape and exam.metric:  # the truth is in metres
+        _score_geometry(exam.geometry, rendering, shape, where)
+        surface = where & rendering.valid
+        seen = lambda depth_z: _seen_points(exam.field, frame, depth_z)
+        exam.points.append(seen(rendering.depth_z)[surface & np.isfinite(rendering.depth_z)])
+        exam.true_points.append(seen(shape["depth_z"])[surface & (shape["depth_z"] > 0)])
+
+
+def _components(sensor: Sensor) -> int:
+    """Of noise-free light: Stokes vectors of a polarization sensor, else channels."""
+    return 3 if sensor.is_polarization else sensor.channel_count
+
+
 class _Mean:
     """Running weighted mean; None when nothing was added."""
 
@@ -165,90 +272,12 @@ def _seen_points(field: Field, frame: Frame, depth_z: np.ndarray) -> np.ndarray:
     return surface_points(frame.camera, field.pose_of(frame), depth_along_rays(frame.camera, depth_z))
 
 
-def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> float | None:
-    """Mean nearest distance between two point clouds, both ways; None when one is empty."""
-    a, b = np.concatenate(ours), np.concatenate(true)
+def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> dict[str, float]:
+    """Mean nearest distance between two point clouds, both ways; nothing when one is empty."""
+    a, b = (np.concatenate(points) if points else np.empty((0, 3)) for points in (ours, true))
     if not len(a) or not len(b):
-        return None
-    return float(0.5 * (cKDTree(b).query(a)[0].mean() + cKDTree(a).query(b)[0].mean()))
-
-
-def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Score a field on test views (definitions: module docstring).
-
-    Args:
-        views: view ids; None: the scene's test views. progress: called with (rays done, rays in all).
-    Returns:
-        ``{"modalities": {name: {"psnr", "psnr_foreground", "foreground_from", "ssim", "psnr_truth", ...}}, "geometry": {...},
-        "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON.
-    Raises:
-        InputError: no frame of these views, or a file that cannot be read.
-    """
-    began = time.perf_counter()
-    chosen = tuple(scene.split.test) if views is None else tuple(views)
-    names = [name for name in field.sensors if name in scene.sensors]
-    frames = [frame for name in names for frame in scene.frames_of(name, chosen)]
-    missing = sorted(set(chosen) - {frame.view for frame in frames})
-    if not frames or (views is not None and missing):
-        what = f"view {missing[0]}" if missing else "test views"
-        raise InputError(f"{scene.root}: no frames of {what} for any of {', '.join(field.sensors)}, expected view ids of the scene.")
-    truth = GroundTruth(scene)
-    # the pose of gt/aligned and gt/geometry; their lengths are metres
-    at_rgb = [frame for frame in scene.frames_of("rgb", chosen) if truth.aligned(frame.view) or truth.geometry(frame.view)]
-    count = Counter(progress, sum(frame.camera.width * frame.camera.height for frame in (*frames, *at_rgb)))
-    scores = {name: _Scores() for name in names}
-    own_pose = {name: _Scores() for name in names}
-    geometry = _Scores()
-    ours: list[np.ndarray] = []
-    true: list[np.ndarray] = []
-    rays, seconds = 0, 0.0
-    for frame in frames:
-        sensor, mine = field.sensors[frame.sensor], scores[frame.sensor]
-        started = time.perf_counter()
-        rendering = field.render(frame.camera, field.pose_of(frame), [sensor.name], geometry=False, progress=count)
-        seconds += time.perf_counter() - started
-        rays += int(rendering.valid.sum())
-        size = rendering.valid.shape
-        region = _checked(truth.region(frame), size, f"gt/masks, {sensor.name} view {frame.view}")
-        _score_raw(mine, sensor, frame, rendering, region)
-        channels = 3 if sensor.is_polarization else sensor.channel_count
-        light = _checked(truth.image(frame), (*size, channels), f"gt, {sensor.name} view {frame.view}")
-        if light is not None:
-            everywhere = np.ones(size, bool)
-            _score_truth(mine, "psnr_truth_full", sensor, rendering, light, everywhere)
-            if region is not None:
-                _score_truth(mine, "psnr_truth", sensor, rendering, light, region)
-            _score_light(own_pose[sensor.name], sensor, rendering, light, everywhere if region is None else region)
-    for frame in at_rgb:
-        aligned = {name: light for name, light in truth.aligned(frame.view).items() if name in names}
-        shape = truth.geometry(frame.view) or {}
-        started = time.perf_counter()
-        rendering = field.render(frame.camera, field.pose_of(frame), list(aligned), geometry=bool(shape), progress=count)
-        seconds += time.perf_counter() - started
-        rays += int(rendering.valid.sum())
-        size = rendering.valid.shape
-        region = shape["in_roi"].astype(bool) if "in_roi" in shape else truth.region(frame)
-        region = _checked(region, size, f"gt region, view {frame.view}")
-        where = np.ones(size, bool) if region is None else region
-        for name, light in aligned.items():
-            sensor = field.sensors[name]
-            _checked(light, (*size, 3 if sensor.is_polarization else sensor.channel_count), f"gt/aligned, {name} view {frame.view}")
-            _score_truth(scores[name], "psnr_aligned", sensor, rendering, light, where)
-            _score_light(scores[name], sensor, rendering, light, where)
-        if "depth_z" in shape and scene.unit == "m":
-            _score_geometry(geometry, rendering, shape, where)
-            surface = where & rendering.valid
-            ours.append(_seen_points(field, frame, rendering.depth_z)[surface & np.isfinite(rendering.depth_z)])
-            true.append(_seen_points(field, frame, shape["depth_z"])[surface & (shape["depth_z"] > 0)])
-    shape_scores = _values(geometry, ("depth_mae", "normal_mae_deg", "hit_rate"))
-    chamfer = _chamfer(ours, true) if ours else None
-    return {
-        "modalities": {name: _summary(scores[name], own_pose[name]) for name in names if scores[name].means},
-        "geometry": shape_scores | ({} if chamfer is None else {"chamfer_visible": chamfer}),
-        "views": sorted({frame.view for frame in frames}),
-        "seconds": {"render": seconds, "total": time.perf_counter() - began},
-        "rays_per_s": rays / max(seconds, 1e-9),
-    }
+        return {}
+    return {"chamfer_visible": float(0.5 * (cKDTree(b).query(a)[0].mean() + cKDTree(a).query(b)[0].mean()))}
 
 
 def _values(scores: _Scores, keys: Sequence[str]) -> dict[str, Any]:

@@ -56,7 +56,7 @@ def exposure_of(linear: np.ndarray, percentile: float = 99.0) -> float:
 
 
 def tone_map(linear: np.ndarray, exposure: float | None = None) -> np.ndarray:
-    """Linear → display values in [0, 1]: exposure (percentile when None), clip, sRGB gamma."""
+    """Linear → display values in [0, 1]: exposure (percentile when None), clip, sRGB gamma (kornia takes a second to import)."""
     x = np.clip(linear * (exposure_of(linear) if exposure is None else exposure), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055).astype(np.float32)
 

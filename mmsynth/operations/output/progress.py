@@ -12,7 +12,7 @@ RaysDone = Callable[[int], None]
 
 
 class Counter:
-    """Adds up what is done and tells the callback, if there is one. Call it with what was done since the last call."""
+    """Adds up what is done and reports it to the callback, if there is one. Call it with what was done since the last call."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
         self.progress, self.total, self.done = progress, total, 0

@@ -1,10 +1,10 @@
 """A sensor's noise figures without a laboratory: from the frames of a scene and the field that was fitted to them, or from frames alone.
 
-A field averages what many frames saw: it says how bright a photosite should be, and how plain the surface is there. What neighbouring
-photosites differ by beyond that is noise, and how that grows with light gives gain, read noise and PRNU
+A field averages over many frames: it gives the expected value of a photosite, and how smooth the picture is there. Differences between
+neighbouring photosites beyond that are noise. How their variance grows with light gives gain, read noise and PRNU
 (``photon_transfer.photon_transfer_of_frames``).
 
-Without a field, the expectation is a blurred copy of the frame: good enough where a picture is plain over some photosites.
+Without a field, the expectation is a blurred copy of the frame: good enough where a picture is smooth over some photosites.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def calibrate_noise(
 ) -> tuple[dict[str, Calibrated], dict[str, str]]:
     """Noise figures of the sensors of a scene, from its frames and the field.
 
-    Each frame has an exposure of its own, which is measured against the field. Short ones tell the read noise.
+    The exposure of each frame is measured against the field. Read noise needs frames of short exposure.
 
     Args:
         modalities: None: all. known: sensor files by modality, whose bits, black level and alignment are believed; without, bits are
@@ -119,10 +119,10 @@ def calibrate_noise(
 
 
 def calibrate_from_frames(file: SensorFile, paths: Sequence[Path]) -> Calibrated:
-    """Noise figures of a sensor from its raw frames alone, of anything that has plain surfaces, bright and dark.
+    """Noise figures of a sensor from its raw frames alone. The frames must show smooth surfaces, bright and dark.
 
     Args:
-        file: says bits, black level, alignment and mosaic.
+        file: gives bits, black level, alignment and mosaic.
     Raises:
         InputError: no frames, frames with all channels at every pixel, or frames that tell nothing.
     """

@@ -24,7 +24,7 @@ VIRTUAL_SUPERSAMPLING = 2
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """A sensor on a field: what to render, and how that becomes its light.
+    """How a field stands in for a sensor: what to render, and how that becomes the light on its pixels.
 
     Attributes:
         file: its figures, without those effects that the field has already. sensor: as a scene describes it. camera: None: of each view.
@@ -45,7 +45,7 @@ class SimulatedSensor:
 
 
 def plan_sensor(field: Field, path: Path, *, delta: bool = False) -> SimulatedSensor:
-    """Read a sensor file and find out how the field can play it.
+    """Read a sensor file and decide how the field can simulate it.
 
     Args:
         delta: of an instance, apply the file's exposure, blur, vignetting, crosstalk and analysers on top of those that the field learned.

@@ -66,7 +66,7 @@ class TrainingRays:
     depth_ray: tuple[np.ndarray, ...]
 
 
-def training_rays(field: Field, scene: Scene, modalities: Sequence[str] | None = None, progress: Progress | None = None) -> TrainingRays:
+def training_rays(field: Field, scene: Scene, *, modalities: Sequence[str] | None = None, progress: Progress | None = None) -> TrainingRays:
     """Depth maps of the training frames, rendered once per field.
 
     Args:
@@ -124,7 +124,7 @@ def view_score(field: Field, rays: TrainingRays, view: PosedCamera) -> float:
     return float(covered[hit].mean(dtype=np.float64)) if hit.any() else 0.0
 
 
-def view_scores(field: Field, rays: TrainingRays, views: Sequence[PosedCamera], progress: Progress | None = None) -> list[float]:
+def view_scores(field: Field, rays: TrainingRays, views: Sequence[PosedCamera], *, progress: Progress | None = None) -> list[float]:
     """``view_score`` of each view; progress is called with (views done, views in all)."""
     scores = []
     for view in views:

@@ -49,7 +49,7 @@ def read_images_txt(path: Path) -> list[StatedPose]:
         if len(tokens) < 10:
             raise InputError(f"{where}: {len(tokens)} values, expected '{_LINE}'.")
         values = floats(tokens[1:8], where, _LINE)
-        if not tokens[8].isdecimal():
+        if not tokens[8].isdecimal() or len(tokens[8]) > 18:
             raise InputError(f"{where}: camera {tokens[8]} is not a whole number, expected '{_LINE}'.")
         camera_id = int(tokens[8])
         if cameras is not None and camera_id not in cameras:

@@ -164,7 +164,7 @@ def _sparse_points(path: Path) -> np.ndarray | None:
 
     try:
         points = np.asarray(getattr(trimesh.load(path), "vertices", ()), dtype=np.float64)
-    except (OSError, ValueError, KeyError, IndexError):
+    except Exception:  # a file of any kind may stand there, and each of trimesh's readers has its own exceptions
         return None
     points = points[np.isfinite(points).all(1)] if points.ndim == 2 and points.shape[1] == 3 else points[:0]
     return points if len(points) else None

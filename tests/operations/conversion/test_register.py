@@ -118,7 +118,7 @@ def test_a_frame_of_something_else_is_refused(field: Field, scene: Scene, what: 
     blocks = np.kron(random.random((15, 20)), np.ones((8, 8)))
     raw = {"noise": random.random((120, 160)), "nothing": np.full((120, 160), 0.3), "another": blocks}[what].astype(np.float32)
     with pytest.raises(InputError, match=r"photo\.png: (\d+ features agree|its pose is uncertain|at the best pose)"):
-        register(field, landmarks(field, scene, "rgb"), raw, CAMERA, "rgb", "photo.png")
+        register(field, landmarks(field, scene, "rgb"), raw, CAMERA, "rgb", name="photo.png")
 
 
 def test_images_without_a_pose_are_converted(field: Field, scene: Scene, tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from torch.utils.data import DataLoader
 import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.operations.dataset.aligned import AlignedDataset, crop_and_flip
-from mmsynth.operations.dataset.generate import DATASET_FORMATS, generate_dataset
+from mmsynth.operations.dataset.generate import generate_dataset
+from mmsynth.operations.dataset.plan import DATASET_FORMATS
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, intensities_to_stokes

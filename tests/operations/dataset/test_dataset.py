@@ -11,8 +11,9 @@ import pytest
 from analytic import AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.operations.dataset.generate import DATASET_FORMATS, generate_dataset
+from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.dataset.index import verify_dataset
+from mmsynth.operations.dataset.plan import DATASET_FORMATS
 from mmsynth.operations.output.work_partition import WorkPartition, partition_of_environment
 from mmsynth.operations.views.coverage import training_rays
 from mmsynth.operations.views.flow import optical_flow

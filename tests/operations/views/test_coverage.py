@@ -166,7 +166,7 @@ def test_score_is_the_mean_coverage() -> None:
     rays = rays_of(field, turned(0), turned(60))
     views = [PosedCamera(LENS, turned(degrees), str(degrees)) for degrees in (20, 100)]
     ticks: list[tuple[int, int]] = []
-    scores = view_scores(field, rays, views, lambda done, total: ticks.append((done, total)))
+    scores = view_scores(field, rays, views, progress=lambda done, total: ticks.append((done, total)))
     for score, view in zip(scores, views, strict=True):
         assert score == pytest.approx(np.nanmean(covered(field, rays, view.camera_to_world)[0]), abs=0.02)
     assert ticks == [(1, 2), (2, 2)]
@@ -176,13 +176,13 @@ def test_frames_of_all_or_some_modalities_count() -> None:
     field = field_of(sphere())
     scene = scene_with([turned(0), turned(180)], others=[(turned(90), FISHEYE)])  # the second tests: not a training frame
     scores = lambda rays: [round(view_score(field, rays, PosedCamera(LENS, turned(degrees))), 3) for degrees in (0, 90, 180)]
-    assert scores(training_rays(field, scene, ["rgb"]))[0::2] == [1.0, 0.0]
-    of_mono, of_all = scores(training_rays(field, scene, ["mono"])), scores(training_rays(field, scene))
+    assert scores(training_rays(field, scene, modalities=["rgb"]))[0::2] == [1.0, 0.0]
+    of_mono, of_all = scores(training_rays(field, scene, modalities=["mono"])), scores(training_rays(field, scene))
     assert of_mono[1] > 0.8 and of_all[0] == 1.0 and of_all[1] == of_mono[1] and of_all[2] < 0.2
     with pytest.raises(InputError, match="modality 'ms': not in this field"):
-        training_rays(field, scene, ["ms"])
+        training_rays(field, scene, modalities=["ms"])
     with pytest.raises(InputError, match="no training frames of mono"):
-        training_rays(field, scene_with([turned(0), turned(180)]), ["mono"])
+        training_rays(field, scene_with([turned(0), turned(180)]), modalities=["mono"])
 
 
 def test_covered_views() -> None:
