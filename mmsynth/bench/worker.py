@@ -20,7 +20,7 @@ import torch
 from mmsynth.bench.jobs import scene_of
 from mmsynth.bench.machine import peak_memory
 from mmsynth.errors import DivergedError, InputError
-from mmsynth.field.kernels import announce_compilation
+from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -41,7 +41,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """
     device = task["device"]
     if device == "cpu":
-        announce_compilation()
+        warm_up()
     began, cpu = time.perf_counter(), time.process_time()
     scene = scene_of(task)
     length = {"steps": task["steps"], "budget": task["budget"]}

@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
+from mmsynth.field.kernels import Sampling
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
-from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
+from mmsynth.field.warmup import warm_up
 from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.scene.serialisation import camera_from_json, camera_to_json, sensor_from_json, sensor_to_json
@@ -219,7 +220,7 @@ class Field(nn.Module):
             points = origins[hit] + directions[hit] * depth[hit, None]
             slope = self.surface.gradient(self.surface.grid.to_grid(points), epsilon, self.sampling.active_surface)
             if self.surface.grid.extent > 1.0:
-                slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
+                slope = kernels.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
             out["normal"] = normal
         return out
@@ -304,7 +305,7 @@ class Field(nn.Module):
         write_atomic(run / "field.safetensors", lambda path: path.write_bytes(content))
         self.manifest["field"] = {
             "design": asdict(self.design),
-            "sampling": asdict(self.sampling),
+            "sampling": self.sampling._asdict(),
             "radiance_scale": self.radiance_scale,
             "view_dependence": self.view_dependence,
             "region": asdict(self.region),
@@ -352,5 +353,5 @@ class Field(nn.Module):
             raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
         field.manifest = manifest
         if device == "cpu":
-            kernels.announce_compilation()  # a run may have been fitted on another machine
+            warm_up()  # a run may have been fitted on another machine
         return field.to(device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels import Sampling
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
 

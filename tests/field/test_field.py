@@ -15,7 +15,8 @@ from torch.nn.functional import normalize, softplus
 
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
-from mmsynth.field.radiance import Shader, intensity, radiance
+from mmsynth.field.kernels import intensity, radiance
+from mmsynth.field.radiance import Shader
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
@@ -36,7 +37,7 @@ def _field(background: bool, region: Region | None = None) -> Field:
     with torch.no_grad():
         field.surface.output_weight.normal_(0, 0.05)
         field.appearance.table.normal_()
-    field.sampling = replace(field.sampling, sharpness=400.0, step=0.005)
+    field.sampling = field.sampling._replace(sharpness=400.0, step=0.005)
     return field
 
 
@@ -56,7 +57,7 @@ def test_normals_are_those_of_the_surface_that_is_seen(background: bool) -> None
     points = (origins + directions * out["depth"][:, None])[hit].double().requires_grad_()
     field.double()
     place = kernels.contract(points) if background else points
-    value = field.surface.reference(place, field.sampling.active_surface)
+    value = kernels.reference.surface_value(place, *field.surface.at(field.sampling.active_surface))
     apart = value.detach().abs()  # the depth is where the surface is; where a ray grazes it, within the soft part
     assert float(apart.quantile(0.95)) < 0.1 * field.sampling.step and float(apart.max()) < 3.5 / field.sampling.sharpness
     (slope,) = torch.autograd.grad(value.sum(), points)
@@ -91,7 +92,7 @@ def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
     field = _field(True, Region((10.0, 0.0, -5.0), 3.0))
     x = np.array([[10.0, 0.0, -5.0], [10.0, 1.8, -5.0], [10.0, 0.0, 25.0], [-300.0, 200.0, 0.0]])
     unit = torch.from_numpy((x - [10.0, 0.0, -5.0]) / 3.0)
-    expected = 3.0 * field.double().surface.reference(kernels.contract(unit), 2)
+    expected = 3.0 * kernels.surface_value(kernels.contract(unit), *field.double().surface.at(2))
     np.testing.assert_allclose(field.float().sdf(x), expected.detach().numpy(), atol=1e-5)
     assert field.sdf(np.empty((0, 3))).shape == (0,)
 
