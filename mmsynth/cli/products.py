@@ -196,33 +196,29 @@ def calibrate_noise(
     out: Annotated[Path | None, typer.Option(help="default: RUN/sensors, or sensors")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure gain, read noise and PRNU by photon transfer, into sensor files; from a scene's frames and its field, or from frames alone."""
+    """Measure gain, read noise and PRNU by photon transfer, into sensor files; from a scene's frames and field, or frames alone."""
     from mmsynth.operations.simulation import calibrate_noise as noise
     from mmsynth.report.text import noise_text
     from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
     from mmsynth.workflows.runs import open_run
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
-    failed: dict[str, str] = {}
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
-        found, destination = {files[0].name: noise.calibrate_from_frames(files[0], frames)}, out or Path("sensors")
+        destination, calibrated, failed = out or Path("sensors"), {files[0].name: noise.calibrate_from_frames(files[0], frames)}, {}
+        noise.write(calibrated, destination)
     else:
         opened = open_run(run)
-        folder, field, scene = opened.folder, opened.field, opened.scene
-        known = noise.by_modality(files)
+        destination = out or opened.folder / "sensors"
         with progress_bar("noise", as_json) as show:
-            found, failed = noise.calibrate_noise(
-                field, scene, modalities=modality_names(modalities), known=known, raw=raw, views=view_ids(views), progress=show
-            )
-        destination = out or folder / "sensors"
-    if found:
-        noise.write(found, destination)
-        facts = {"out": str(destination), "sensors": {n: c.to_json() for n, c in found.items()}}
-        print(json.dumps(facts) if as_json else noise_text(found))
-        if not as_json:
-            print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
+            calibrated, failed = noise.calibrate_noise(
+                opened.field, opened.scene, modalities=modality_names(modalities), known=noise.by_modality(files), raw=raw,
+                views=view_ids(views), out=destination, progress=show,
+            )  # fmt: skip
+    if calibrated:
+        facts = {"out": str(destination), "sensors": {n: c.to_json() for n, c in calibrated.items()}}
+        print(json.dumps(facts) if as_json else noise_text(calibrated, destination))
     if failed:
         raise InputError(" ".join(failed.values()))
 
