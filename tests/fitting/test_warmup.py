@@ -1,7 +1,11 @@
 """A fit's own clock holds no compilation."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+import pytest
 from numba.core.dispatcher import Dispatcher
 
 from mmsynth.field.kernels import cpu
@@ -28,3 +32,18 @@ def test_a_fit_compiles_nothing_after_it_began(tmp_path: Path) -> None:
     frame = load_scene(data_folder("example_scene")).frames[0]
     field.render(frame.camera, frame.camera_to_world)
     assert _signatures() == before
+
+
+@pytest.mark.slow
+def test_another_process_compiles_and_this_one_loads(tmp_path: Path) -> None:
+    """Else a first fit would round otherwise than all later ones."""
+    program = (
+        "from mmsynth.field.warmup import warm_up; warm_up()\n"
+        "from mmsynth.field.kernels import cpu\n"
+        "print([(len(k.stats.cache_hits), len(k.stats.cache_misses)) for k in cpu.KERNELS])"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True
+    )
+    assert run.stdout == f"{[(1, 0)] * len(cpu.KERNELS)}\n", run.stderr
+    assert run.stderr.startswith("compiling kernels once")
