@@ -1,4 +1,4 @@
-"""The field of a scene: what is learned by a fit and asked by every operation."""
+"""The field of a scene: learned by a fit, rendered by every operation."""
 
 from __future__ import annotations
 

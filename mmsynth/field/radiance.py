@@ -1,4 +1,4 @@
-"""Radiance: appearance features in space, composited along the ray and shaded once per ray, with a head per modality."""
+"""Radiance: appearance features in space, composited along the ray and shaded once per ray, with one head for each modality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How samples become pixels: rays through the surface, sections between samples, and the appearance where they cross it.
+"""Volume rendering: samples along rays, weights of the sections between samples, appearance where sections cross the surface.
 
 All lengths are in the normalised frame, where the region of interest is the unit ball. Where a scene has a background, all of
 space is contracted into a ball of radius 2, and the one surface reaches as far as rays do.
@@ -31,7 +31,7 @@ def ball_interval(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def interval(surface: Surface, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays begin and end: near, far (R,)."""
+    """Where sampling of rays begins and ends: near, far (R,)."""
     if surface.grid.extent > 1.0:
         # a surface right before a camera explains its picture and no other: there is none
         near = (_FREE * (torch.linalg.vector_norm(origins, dim=-1) - 1.0)).clamp(min=NEAR)

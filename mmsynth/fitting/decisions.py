@@ -1,4 +1,4 @@
-"""What residuals say in the middle of a fit: how far radiance depends on the direction, and whether frames were exposed differently.
+"""Two questions that residuals answer during a fit: how far radiance depends on direction, and whether exposures differ between frames.
 
 Rays of all frames are compared with what was measured. Half of them may be learned from, the other half judges.
 """

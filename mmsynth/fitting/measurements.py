@@ -1,4 +1,4 @@
-"""The pixels to learn from, in memory as they were stored, and random batches of them as rays."""
+"""The training pixels, in memory as they were stored, and random batches of them as rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether and when poses are refined: decided by evidence, then Gauss-Newton steps between the steps of the fit."""
+"""Refinement of poses: whether it is worth it, then Gauss-Newton steps between the steps of the fit."""
 
 from __future__ import annotations
 

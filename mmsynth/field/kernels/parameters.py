@@ -51,7 +51,7 @@ class ShaderWeights(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """How finely a ray is seen.
+    """How finely a ray is sampled.
 
     Attributes:
         sharpness: s of the surface; its soft part is about 3.5 / s thick. step: between samples at the surface, in contracted
