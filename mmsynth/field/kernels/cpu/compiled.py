@@ -1,4 +1,4 @@
-"""Whether the kernels have code."""
+"""The kernels of a fit, and whether they have code."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mmsynth.field.kernels.cpu import marching, optimiser, shading, surface, tra
 
 KERNELS = (
     surface.surface_forward, surface.surface_backward, surface.surface_scatter,
-    marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_scatter,
+    marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
     shading.compare, shading.shade, optimiser.adam_parts, optimiser.adam_part,
 )  # fmt: skip
 
