@@ -203,10 +203,11 @@ def calibrate_noise(
     from mmsynth.workflows.runs import open_run
 
     files = [load_sensor(find_sensor_file(name)) for name in sensor or []]
+    failed: dict[str, str] = {}
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
-        destination, calibrated, failed = out or Path("sensors"), {files[0].name: noise.calibrate_from_frames(files[0], frames)}, {}
+        destination, calibrated = out or Path("sensors"), {files[0].name: noise.calibrate_from_frames(files[0], frames)}
         noise.write(calibrated, destination)
     else:
         opened = open_run(run)

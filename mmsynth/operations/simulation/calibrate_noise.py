@@ -94,7 +94,8 @@ def calibrate_noise(
         modalities: None: all. known: sensor files by modality, whose bits, black level and alignment are believed; without, bits are
             those that the frames use, and black is 0. raw: a folder with other frames of the same poses, of any exposure,
             ``raw/MODALITY/0009.png``.
-        views: of which frames; None: the training views, or all that ``raw`` has. out: folder for the sensor files (``write``). progress: called with (rays done, rays in all).
+        views: of which frames; None: the training views, or all that ``raw`` has.
+        out: folder for the sensor files (``write``). progress: called with (rays done, rays in all).
     Returns:
         the figures by modality; and, of modalities whose frames tell nothing (see ``photon_transfer_of_frames``) or whose frames the
         field does not explain, a sentence that says why.
