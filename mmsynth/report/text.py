@@ -66,7 +66,8 @@ def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
 
 def noise_text(calibrated: Mapping[str, Calibrated], out: Path) -> str:
     """The result of ``calibrate-noise``, written to ``out``: one row per sensor, with standard deviations; "<": too small
-    to be measured, and the least that would have been; "–": one frame alone shows no pattern. Exposure: the frames' median, in units of what the field learned."""
+    to be measured, and the least that would have been; "–": one frame alone shows no pattern.
+    Exposure: the frames' median, in units of what the field learned."""
     lines = [
         f"{'sensor':14s}{'frames':>7s}{'exposure':>9s}{'bits':>5s}{'gain [DN/e-]':>20s}{'full scale [e-]':>18s}{'read [e-]':>14s}"
         f"{'PRNU [%]':>14s}"
