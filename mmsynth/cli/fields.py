@@ -154,7 +154,7 @@ def batch(
 
 @command("doctor")
 def doctor(as_json: JsonOption = False) -> None:
-    """Versions, threads, GPU, kernels, and what to do."""
+    """Print versions, threads, GPU, state of the compiled kernels, and advice."""
     from mmsynth.bench.doctor import diagnose, render_text
 
     facts = diagnose()
