@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from mmsynth.field.field import Field
+from mmsynth.field.storage import save_field
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_text
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
@@ -98,7 +99,7 @@ def fit(
     _save(run, trainer, log)
     field = _finished(trainer)
     field.manifest = _manifest(trainer, scene)
-    field.save(run)
+    save_field(field, run)
     return field
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -110,7 +111,7 @@ def _fit_and_generate(path: Path, out: Path, job: SceneJob) -> dict[str, Any]:
 
 def _fitted(scene: Scene, run: Path, job: SceneJob) -> Field:
     if (run / "manifest.json").is_file():
-        return Field.load(run, local_device(job.device))
+        return load_field(run, local_device(job.device))
     resume = (run / "checkpoint/state.pt").is_file()
     device = local_device(job.device)
     field = fit(scene, run, recipe=job.recipe, steps=job.steps, budget=job.seconds, seed=job.seed, device=device, resume=resume)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize, softplus
 
+from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.kernels import intensity, radiance
 from mmsynth.field.radiance import Shader
+from mmsynth.field.storage import load_field, save_field
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
@@ -161,8 +164,8 @@ def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> No
     field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
     field.occupancy.states[3, 4, 5] = 17
     field.sensors["nir"] = replace(NIR, saturation=float("inf"), mosaic=np.array([[0]]))
-    field.save(tmp_path)
-    again = Field.load(tmp_path)
+    save_field(field, tmp_path)
+    again = load_field(tmp_path)
     assert (again.design, again.region, again.sampling, again.radiance_scale) == (
         field.design,
         field.region,
@@ -173,6 +176,16 @@ def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> No
     assert int(again.occupancy.states[3, 4, 5]) == 17 and again.surface.grid.extent == field.surface.grid.extent
     a, b = _look_around(field, 50)[2], _look_around(again, 50)[2]
     assert all(torch.equal(a[name].nan_to_num(), b[name].nan_to_num()) for name in a)
+
+
+@pytest.mark.parametrize(("stated", "found"), [(None, "no format"), (1, "format 1"), (99, "format 99")])
+def test_a_run_of_another_version_is_refused(tmp_path: Path, stated: int | None, found: str) -> None:
+    save_field(_field(False), tmp_path)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    del manifest["format"]
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest | ({} if stated is None else {"format": stated})))
+    with pytest.raises(InputError, match=rf"manifest\.json: {found}, expected 2: .*another version of mmsynth; fit the scene again\.$"):
+        load_field(tmp_path)
 
 
 def test_modalities_have_their_own_outputs() -> None:
