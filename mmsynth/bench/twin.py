@@ -241,7 +241,7 @@ def _read_bound(signal: np.ndarray, model: NoiseModel) -> float:
 
 
 def spectra() -> list[Method]:
-    """A band of 30 nm put together from N measured bands over 400 to 700 nm: error on smooth random spectra, and the one foretold."""
+    """A band of 30 nm put together from N measured bands over 400 to 700 nm: error on smooth random spectra, and the expected one."""
     nm = np.arange(400.0, 701.0, 2.0)
     apart = 3.0**0.5 * np.abs(nm[:, None] - nm) / SMOOTH_NM
     random = np.random.default_rng(0)
@@ -261,7 +261,7 @@ def spectra() -> list[Method]:
             error = found.weights @ noisy - truth
             return {
                 "error": float(np.sqrt(np.mean(error**2) / np.mean(truth**2))),
-                "foretold": found.residual,
+                "expected_error": found.residual,
                 "noise_gain": found.noise_gain,
             }
 
@@ -301,7 +301,7 @@ def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         Column("deviations", "deviations", ".1f"),
         Column("error", "error", ".1e"),
         Column("worst", "worst", ".1e"),
-        Column("foretold", "foretold", ".1e"),
+        Column("expected_error", "expected error", ".1e"),
         Column("noise gain", "noise_gain", ".2f"),
         Column("gain", "gain", ".1%"),
         Column("read", "read", ".1%"),
