@@ -74,11 +74,7 @@ def read_native(path: Path) -> np.ndarray:
 
 
 def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndarray]:
-    """All arrays of an npz file; ``name``: for errors.
-
-    Raises:
-        InputError: missing or damaged.
-    """
+    """All arrays of an npz file; ``name``: for errors. Raises InputError: missing or damaged."""
     try:
         with np.load(file) as arrays:
             return {key: arrays[key] for key in arrays.files}
@@ -190,11 +186,7 @@ def _read_dng(path: Path) -> np.ndarray:
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """The channels (H, W) of an EXR file, by name.
-
-    Raises:
-        InputError: missing or damaged.
-    """
+    """The channels (H, W) of an EXR file, by name. Raises InputError: missing or damaged."""
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings there, and --json promises nothing else
             file = OpenEXR.File(str(path), separate_channels=True)

@@ -50,7 +50,7 @@ def load_scene(path: Path | str, *, modalities: Sequence[str] | None = None) -> 
         # poses and region in different frames: the few that still see it do so by accident
         raise InputError(
             f"{path}: {len(blind)} of {len(scene.frames)} frames do not see the region of interest "
-            f"(centre {_rounded(scene.region.centre)}, radius {scene.region.radius:.4g}), "
+            f"(centre ({', '.join(f'{value:.4g}' for value in scene.region.centre)}), radius {scene.region.radius:.4g}), "
             "expected poses and region in one frame."
         )
     if blind:
@@ -63,11 +63,9 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str] | None], Scene]:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
     if path.is_file():
-        if path.name == "meta_data.json":
-            return read_mmsdata
-        if path.suffix.lower() == ".json":
-            return read_nerfstudio
-        raise InputError(f"{path}: not a scene, expected a folder or its JSON file.")
+        if path.suffix.lower() != ".json":
+            raise InputError(f"{path}: not a scene, expected a folder or its JSON file.")
+        return read_mmsdata if path.name == "meta_data.json" else read_nerfstudio
     if (path / "meta_data.json").is_file():
         return read_mmsdata
     if (path / "transforms.json").is_file():
@@ -162,16 +160,9 @@ def _looks(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def _lens_problems(scene: Scene) -> list[str]:
     """A sentence for every sensor whose lens model has no ray for a part of its pictures, or rays that do not come back."""
-    errors: dict[str, float] = {}
-    lost: dict[str, float] = {}
-    for sensor, camera in dict.fromkeys((frame.sensor, frame.camera) for frame in scene.frames):
+    errors, lost = dict.fromkeys(scene.sensors, 0.0), dict.fromkeys(scene.sensors, 0.0)
+    for name, camera in dict.fromkeys((frame.sensor, frame.camera) for frame in scene.frames):
         error, missing = round_trip_error(camera, _grid(camera))
-        errors[sensor], lost[sensor] = max(errors.get(sensor, 0.0), error), max(lost.get(sensor, 0.0), missing)
-    found = [
-        f"{n}: the lens model has no ray for about {share:.0%} of the pixels; they are not used." for n, share in lost.items() if share
-    ]
+        errors[name], lost[name] = max(errors[name], error), max(lost[name], missing)
+    found = [f"{n}: the lens model has no ray for about {part:.0%} of the pixels; they are not used." for n, part in lost.items() if part]
     return found + [f"{n}: rays come back {e:.1g} pixels from where they began." for n, e in errors.items() if e > _ROUND_TRIP]
-
-
-def _rounded(point: tuple[float, float, float]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"

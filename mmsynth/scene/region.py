@@ -29,17 +29,11 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
     """
     centres = np.stack([pose[:3, 3] for pose in poses])
     axes = np.stack([pose[:3, 2] for pose in poses])
-    half_view = np.array([_half_view(camera) for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (N, 3, 3): removes the part along each axis
-    normal = across.mean(0)
-    # smallest eigenvalue = mean squared sine between the axes and their common direction: 1e-4 is about half a degree
-    if np.linalg.eigvalsh(normal)[0] > 1e-4:
-        # solved about the mean position: worlds far from their origin (survey coordinates) keep their digits
-        mean = centres.mean(0)
-        point = mean + np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres - mean) / len(centres))
-        if _before(point, centres, axes):
-            return _filling(point, centres, half_view)
     mean = centres.mean(0)
+    half_view = np.array([np.arctan(max(c.width / c.fx, c.height / c.fy) / 2) for c in cameras])  # of the larger side
+    point = nearest_to_rays(centres, axes)
+    if point is not None and _before(point, centres, axes):
+        return _filling(point, centres, half_view)
     reach = 2 * float(np.linalg.norm(centres - mean, axis=1).max())
     reach = reach if reach > 1e-9 * max(1.0, float(np.linalg.norm(mean))) else 1.0  # one position up to rounding
     direction = axes.mean(0)
@@ -48,6 +42,18 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
         # cameras that face each other along one line, or a panorama
         return _filling(mean, centres, half_view) if _before(mean, centres, axes) else ball(mean, reach)
     return ball(mean + reach * direction / length, reach * float(np.sin(np.median(half_view))))
+
+
+def nearest_to_rays(origins: np.ndarray, directions: np.ndarray) -> np.ndarray | None:
+    """The point (3,) nearest to all lines, origins and unit directions (N, 3) each (least squares); None where they are almost parallel."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # (N, 3, 3): removes the part along each line
+    normal = across.mean(0)
+    # smallest eigenvalue = mean squared sine between the lines and their common direction: 1e-4 is about half a degree
+    if np.linalg.eigvalsh(normal)[0] <= 1e-4:
+        return None
+    # solved about the mean position: worlds far from their origin (survey coordinates) keep their digits
+    mean = origins.mean(0)
+    return np.asarray(mean + np.linalg.solve(normal, np.einsum("nij,nj->i", across, origins - mean) / len(origins)))
 
 
 def _before(point: np.ndarray, centres: np.ndarray, axes: np.ndarray) -> bool:
@@ -83,8 +89,3 @@ def region_from_points(points: np.ndarray, seen: Region, positions: np.ndarray) 
     room = 0.9 * float(np.linalg.norm(outside - middle, axis=1).min()) if len(outside) else reach
     radius = min(reach, seen.radius, room)
     return ball(middle, radius) if radius > 0 else seen
-
-
-def _half_view(camera: Camera) -> float:
-    """Half the larger field of view, in radians."""
-    return float(np.arctan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))

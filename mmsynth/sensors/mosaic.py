@@ -22,11 +22,7 @@ BAYER = {  # channels 0, 1, 2 = red, green, blue, and OpenCV's name of the patte
 
 
 def pattern_of(given: Any) -> np.ndarray:
-    """A pattern (h, w) int64 from nested lists.
-
-    Raises:
-        ValueError: how it is wrong; not a matrix, or channels left out.
-    """
+    """A pattern (h, w) int64 from nested lists. Raises ValueError: how it is wrong; not a matrix, or channels left out."""
     try:
         pattern = np.asarray(given)
     except ValueError:

@@ -193,13 +193,9 @@ class SensorFile(_Strict):
 
 
 def find_sensor_file(name_or_path: str, beside: Path | None = None) -> Path:
-    """A TOML file, sought beside another one first, or a packaged sensor by its name.
-
-    Raises:
-        InputError: there is none.
-    """
+    """A TOML file, sought beside another one first, or a packaged sensor by its name. Raises InputError: there is none."""
     path = Path(name_or_path)
-    for candidate in ([beside / path] if beside is not None else []) + [path]:
+    for candidate in (path if beside is None else beside / path, path):
         if candidate.suffix and candidate.is_file():
             return candidate
     folder = data_folder("recipes") / "sensors"
@@ -211,11 +207,7 @@ def find_sensor_file(name_or_path: str, beside: Path | None = None) -> Path:
 
 
 def load_sensor(path: Path) -> SensorFile:
-    """Read a sensor file.
-
-    Raises:
-        InputError: unreadable file, broken TOML, an unknown key, or a value that cannot be.
-    """
+    """Read a sensor file. Raises InputError: unreadable file, broken TOML, an unknown key, or a value that cannot be."""
     return read_toml(path, SensorFile)
 
 

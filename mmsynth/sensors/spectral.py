@@ -45,11 +45,7 @@ class Combination:
 
 
 def combine(virtual: Response, measured: Sequence[Response], relative_error: float = MEASURED_ERROR) -> Combination:
-    """The weights of measured channels that make a virtual one, and how well they do.
-
-    Raises:
-        ValueError: nothing measured.
-    """
+    """The weights of measured channels that make a virtual one, and how well they do. Raises ValueError: nothing measured."""
     if not measured:
         raise ValueError("no measured responses")
     ranges = np.array([r.range_nm() for r in (virtual, *measured)])

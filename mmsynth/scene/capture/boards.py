@@ -10,6 +10,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.scene.images import read_image
+from mmsynth.scene.region import nearest_to_rays
 from mmsynth.scene.scene import Frame
 from mmsynth.sensors.camera import project, unproject
 
@@ -88,18 +89,11 @@ def _triangulated(seen: list[Sighting]) -> np.ndarray | None:
     """The point nearest to all rays (least squares), (3,); None where too few views see it or they do not agree."""
     if len(seen) < _VIEWS:
         return None
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for frame, pixel in seen:
-        direction, valid = unproject(pixel, frame.camera)
-        if not valid:
-            return None
-        ray = frame.camera_to_world[:3, :3] @ direction
-        across = np.eye(3) - np.outer(ray, ray)
-        normal += across
-        right += across @ frame.camera_to_world[:3, 3]
-    if np.linalg.eigvalsh(normal)[0] < 1e-4 * len(seen):
-        return None  # rays almost parallel
-    point = np.linalg.solve(normal, right)
+    directions, valid = zip(*(unproject(pixel, frame.camera) for frame, pixel in seen), strict=True)
+    poses = np.stack([frame.camera_to_world for frame, _ in seen])
+    point = nearest_to_rays(poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], directions)) if all(valid) else None
+    if point is None:
+        return None
     for frame, pixel in seen:
         local = frame.camera_to_world[:3, :3].T @ (point - frame.camera_to_world[:3, 3])
         apart = np.linalg.norm(project(local, frame.camera) - pixel) * min(1.0, _WIDTH / max(frame.camera.width, frame.camera.height))

@@ -43,6 +43,7 @@ from mmsynth.scene.scene import (
     canonical_modality,
     make_split,
 )
+from mmsynth.scene.serialisation import camera_to_json, channels_to_json
 from mmsynth.sensors.camera import Camera
 
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE")
@@ -121,27 +122,20 @@ def meta_content(
     for sensor in sensors:
         cameras = {frame.camera for frame in frames[sensor.name].values()}
         if len(cameras) != 1:
-            raise InputError(
-                f"{root}: {len(cameras)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames of a sensor."
-            )
+            raise InputError(f"{root}: {len(cameras)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames.")
         (camera,) = cameras
         if camera.lens != "brown_conrady" or any(camera.coefficients[6:]):
-            raise InputError(
-                f"{root}: the lens of '{sensor.name}' does not fit MMS-DATA, which holds k1 k2 p1 p2 k3 k4 of Brown and Conrady."
-            )
+            raise InputError(f"{root}: the lens of '{sensor.name}' does not fit MMS-DATA, which holds Brown-Conrady's k1 k2 p1 p2 k3 k4.")
         if raw and sensor.mosaic is None and sensor.channel_count > 1 and sensor.name in KNOWN:
             raise InputError(f"{root}: '{sensor.name}' has no mosaic, which MMS-DATA does not hold beside sensors that have one.")
         entry: dict[str, Any] = {
             "camera_model": "OPENCV",
-            "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+            **{key: value for key, value in camera_to_json(camera).items() if key not in ("lens", "distortion")},
             "distortion_params": camera.coefficients[:6].tolist(),
-            "channels": list(sensor.channels),
-            "wavelengths_nm": list(sensor.wavelengths_nm),
-        }  # fmt: skip
+            **{key: value for key, value in channels_to_json(sensor).items() if value is not None},
+        }
         if raw and (sensor.mosaic is not None or sensor.channel_count == 1):
             entry["mosaick_pattern"] = [[0]] if sensor.mosaic is None else sensor.mosaic.tolist()
-        if sensor.polarizer_angles_deg is not None:
-            entry["polarizer_angles_deg"] = list(sensor.polarizer_angles_deg)
         entry["frames"] = []
         for view, frame in frames[sensor.name].items():
             moved = frame.camera_to_world.copy()
