@@ -188,16 +188,18 @@ def load_recipe(name_or_path: str | None) -> Recipe:
     Raises:
         InputError: no such recipe, broken TOML, an unknown key, or a value out of range.
     """
-    if name_or_path is None:
-        return Recipe()
+    return Recipe() if name_or_path is None else read_toml(recipe_path(name_or_path, data_folder("recipes"), "recipe"), Recipe)
+
+
+def recipe_path(name_or_path: str, folder: Path, what: str) -> Path:
+    """A TOML file, or the one of this name in a folder."""
     path = Path(name_or_path)
     if not path.suffix:
-        folder = data_folder("recipes")
         path = folder / f"{name_or_path}.toml"
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-            raise InputError(f"recipe {name_or_path!r}: not found, expected one of {known} or a TOML file.")
-    return read_toml(path, Recipe)
+            raise InputError(f"{what} {name_or_path!r}: not found, expected one of {known} or a TOML file.")
+    return path
 
 
 def keys_as_markdown() -> str:
