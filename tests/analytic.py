@@ -132,6 +132,25 @@ class AnalyticField:
 SOURCE_NAMES = {"pol": "polarization", "ms": "multispectral"}
 
 
+def stripes(points_u: np.ndarray, points_v: np.ndarray) -> np.ndarray:
+    return 1.0 + 0.2 * np.sin(points_u / 3.0) * np.cos(points_v / 4.0)
+
+
+class WrongField(AnalyticField):
+    """Its light is off by a pattern, the same in all modalities, as where a shadow or an edge is out of place."""
+
+    wrong = True
+
+    def render(self, camera: Camera, *args: Any, **how: Any) -> Any:
+        seen = super().render(camera, *args, **how)
+        if self.wrong:
+            v, u = np.mgrid[: camera.height, : camera.width]
+            for group in (seen.channels, seen.stokes):
+                for values in group.values():
+                    values /= stripes(u, v)[..., None].astype(np.float32)
+        return seen
+
+
 def ring_pose(view: int, views: int) -> np.ndarray:
     angle = 2 * np.pi * view / views
     return look_at((2.2 * np.cos(angle), 2.2 * np.sin(angle), 1.0))

@@ -89,7 +89,7 @@ def test_commands_and_options(path: Path) -> None:
         used = {re.split("=", word)[0] for word in words if word.startswith("--")}
         assert used <= {*options_of(words), "--help"}, f"mmsynth {' '.join(words)}"
     every = {option for name in COMMANDS if name != "bench" for option in options_of([name])}
-    alone = {text.split()[0] for text in INLINE.findall(prose(path.read_text(encoding="utf-8"))) if text.startswith("--")}
+    alone = {text.split()[0] for text in INLINE.findall(prose(path.read_text(encoding="utf-8"))) if text.startswith("-")}
     assert alone <= {*every, *options_of(["bench", "ablation"])}
 
 

@@ -25,13 +25,11 @@ from mmsynth.bench.output import Report, new_figure, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
-from mmsynth.field.kernels import cpu, cuda, reference
+from mmsynth.field.kernels import Sampling, cpu, cuda, reference
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
-from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
-from mmsynth.fitting import losses
-from mmsynth.fitting.measurements import Batch
+from mmsynth.field.warmup import warm_up
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.scene import Sensor
 
@@ -110,7 +108,7 @@ def _field() -> Inputs:
         nn.init.normal_(surface.output_weight, std=0.1)
         nn.init.normal_(appearance.table)
         occupancy = Occupancy(64)
-        occupancy.update(lambda x: surface.reference(x, _LEVELS[0]), _SAMPLING.sharpness, _generator(), 1.0)
+        occupancy.update(lambda x: reference.surface_value(x, *surface.at(_LEVELS[0])), _SAMPLING.sharpness, _generator(), 1.0)
     return {"surface": surface, "appearance": appearance, "occupancy": occupancy}
 
 
@@ -129,28 +127,21 @@ def _surface_traffic(inputs: Inputs, samples: int) -> tuple[float, float]:
     return forward, forward + samples * (levels * 256 + 4)
 
 
-class _Plain(nn.Module):
-    """A surface that takes no kernels."""
-
-    def __init__(self, surface: Surface) -> None:
-        super().__init__()
-        self.grid, self.reference = surface.grid, surface.reference
-
-    def forward(self, positions: Tensor, active: int) -> Tensor:
-        return self.reference(positions, active)
+def _surface(backend: Any) -> Callable[[Inputs], Outputs]:
+    return lambda x: (backend.surface_value(x["positions"], *x["surface"].at(_LEVELS[0])),)
 
 
-def _trace(x: Inputs) -> Outputs:
-    hits = rendering.trace(x["surface"], x["appearance"], x["occupancy"], x["origins"], x["directions"], x["jitter"], _SAMPLING)
-    return torch.cat([hits.features, hits.opacity[:, None]], 1), hits.samples
+def _trace(backend: Any) -> Callable[[Inputs], Outputs]:
+    def trace(x: Inputs) -> Outputs:
+        tables = *x["surface"].at(_LEVELS[0]), x["appearance"].at(_LEVELS[1])
+        hits = backend.trace(*tables, x["occupancy"].states, _rays_of(x), _SAMPLING)
+        return torch.cat([hits.features, hits.opacity[:, None]], 1), hits.samples
+
+    return trace
 
 
-def _trace_by_parts(x: Inputs) -> Outputs:
-    surface: Any = _Plain(x["surface"])
-    hits = rendering.trace_by_parts(
-        surface, x["appearance"], x["occupancy"], x["origins"], x["directions"], x["near"], x["far"], x["jitter"], _SAMPLING
-    )
-    return torch.cat([hits.features, hits.opacity[:, None]], 1), hits.samples
+def _rays_of(x: Inputs) -> kernels.Rays:
+    return kernels.Rays(*(x[name] for name in kernels.Rays._fields))
 
 
 def _compare_inputs(samples: int) -> Inputs:
@@ -169,16 +160,15 @@ def _compare_inputs(samples: int) -> Inputs:
     constants = {name: torch.full((samples,), value) for name, value in (("level", 1.0), ("saturation", 0.9), ("weight", 1 / samples))}
     return {
         "shader": shader, "features": torch.randn(samples, _field()["appearance"].width, generator=g), "directions": unit(samples),
-        "degrees": torch.full((samples,), 3), "teaches": torch.ones(samples, dtype=torch.bool), "ray": torch.arange(samples),
+        "degrees": torch.full((samples,), 3), "trains_geometry": torch.ones(samples, dtype=torch.bool), "ray": torch.arange(samples),
         "output": output, "axes": unit(tensors), **values, **constants,
     }  # fmt: skip
 
 
-def _compare(compare: Callable[..., Outputs]) -> Callable[[Inputs], Outputs]:
+def _compare(backend: Any) -> Callable[[Inputs], Outputs]:
     def call(x: Inputs) -> Outputs:
-        names = "directions", "target", "ray", "output", "axes", "level", "saturation", "weight"
-        batch = Batch(**{n: x[n] for n in names}, origins=x["directions"], frame=x["ray"], parts={}, alpha=x["opacity"])
-        return compare(x["shader"], x["features"], x["opacity"], batch, x["degrees"], x["teaches"])
+        rays, measured = (kind(*(x[name] for name in kind._fields)) for kind in (kernels.ShadedRays, kernels.Measured))
+        return backend.compare(x["shader"].weights(), rays, measured)
 
     return call
 
@@ -212,7 +202,7 @@ def _march(backend: Any) -> Callable[[Inputs], Outputs]:
     def march(x: Inputs) -> Outputs:
         ball = lambda p: torch.linalg.vector_norm(p, dim=-1) - 0.5  # nearly free: it is the march that is timed
         states = x["occupancy"].states
-        return backend.march(ball, x["origins"], x["directions"], x["near"], x["far"], x["jitter"], states, 1.0, _SAMPLING)
+        return backend.march(ball, _rays_of(x), states, 1.0, _SAMPLING)
 
     return march
 
@@ -241,26 +231,21 @@ OPERATIONS: tuple[Operation, ...] = (
     Operation(
         "surface_value",
         _surface_inputs,
-        {
-            "torch": lambda x: (x["surface"].reference(x["positions"], _LEVELS[0]),),
-            "numba": lambda x: (cpu.surface_value(x["surface"], x["positions"], _LEVELS[0]),),
-            # one kernel without a gradient; with one, single operations
-            "triton": lambda x: (kernels.surface_value(x["surface"], x["positions"], _LEVELS[0]),),
-        },
+        {"torch": _surface(reference), "numba": _surface(cpu), "triton": _surface(cuda)},
         leaves=lambda x: list(x["surface"].parameters()),
         traffic=_surface_traffic,
     ),
     Operation(
         "trace",
         lambda samples: _rays(samples) | _field(),
-        {"torch": _trace_by_parts, "numba": _trace, "triton": _trace},
+        {"torch": _trace(reference), "numba": _trace(cpu), "triton": _trace(cuda)},
         leaves=lambda x: [*x["surface"].parameters(), x["appearance"].table],
         count=lambda output: int(output[1]),
     ),
     Operation(
         "compare",
         _compare_inputs,
-        {"torch": _compare(losses.compare_by_parts), "numba": _compare(losses.compare), "torch cuda": _compare(losses.compare_by_parts)},
+        {"torch": _compare(reference), "numba": _compare(cpu), "torch cuda": _compare(reference)},
         leaves=lambda x: [*x["shader"].parameters(), x["features"], x["opacity"]],
         count=lambda output: len(output[1]),
     ),
@@ -318,7 +303,7 @@ def bench_kernels(samples: int, out: Path, threads: int | None = None, progress:
     rows: list[dict[str, Any]] = []
     with use_threads(threads):
         machine = measure()
-        kernels.announce_compilation()
+        warm_up()
         backends = available_backends()
         chosen = [o for o in OPERATIONS if len(o.calls.keys() & backends) > 1]
         for done, operation in enumerate(chosen):

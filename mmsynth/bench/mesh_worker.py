@@ -17,6 +17,7 @@ from mmsynth.bench.machine import peak_memory
 from mmsynth.bench.worker import serve
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field
 from mmsynth.operations.mesh.attributes import training_views
 from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
 from mmsynth.operations.mesh.quality import compare_meshes, describe_mesh, load_reference
@@ -63,7 +64,7 @@ def work(task: Mapping[str, Any], _: Path) -> dict[str, Any]:
     Raises:
         InputError: no such run, scene or reference, or nothing to mesh.
     """
-    field = Field.load(Path(task["run"]))
+    field = load_field(Path(task["run"]))
     scene = load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors))
     reference = None if task["against"] is None else load_reference(Path(task["against"]))
     began, cpu = time.perf_counter(), time.process_time()

@@ -25,7 +25,7 @@ COLUMNS = (
     Column("ns", "ns", ".1f"),
     *numbers(".5g", {"found": "found", "closed form": "truth"}),
     Column("deviations", "deviations", ".1f"),
-    *numbers(".1e", {"error": "error", "worst": "worst", "foretold": "foretold"}),
+    *numbers(".1e", {"error": "error", "worst": "worst", "expected error": "expected_error"}),
     Column("noise gain", "noise_gain", ".2f"),
     *numbers(".1%", {"gain": "gain", "read": "read", "read, at best": "read_at_best", "PRNU": "prnu"}),
     Column("in", "unit"),

@@ -25,10 +25,9 @@ from mmsynth.bench.methods import Method, chosen_families, family_tables, measur
 from mmsynth.bench.output import Report, scatter_panels, write_report
 from mmsynth.bench.tables import Column, numbers
 from mmsynth.errors import InputError
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import TILE, Field
-from mmsynth.field.kernels import reference
-from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels import Sampling, reference
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
@@ -120,8 +119,7 @@ def rays_of(field: Field, scene: Scene) -> Rays:
 
 def fine(sampling: Sampling, coarser: float = 1.0) -> Sampling:
     """The sampling of the reference, or one of a longer step."""
-    return dataclasses.replace(
-        sampling,
+    return sampling._replace(
         max_optical_depth=FINE_OPAQUE,
         step=sampling.step * FINE_STEP * coarser,
         sphere_step_factor=FINE_STRIDE * coarser,
@@ -140,13 +138,12 @@ def truth_of(field: Field, rays: Rays) -> Truth:
 def _exact(field: Field, rays: Rays, sampling: Sampling) -> tuple[Outputs, float]:
     """By single operations, and not as many samples a ray as the kernel has room for but as many as it takes."""
     surface, parts, samples = field.surface, [], 0
+    sdf = lambda x: surface(x, sampling.active_surface)
     for origins, directions, camera_x in rays.tiles(_FINE_RAYS):
         near, far = rendering.interval(surface, origins, directions)
-        taken = reference.march(
-            lambda x: surface(x, sampling.active_surface), origins, directions, near, far, torch.full_like(near, 0.5),
-            field.occupancy.states, surface.grid.extent, sampling, _FINE_MOST,
-        )  # fmt: skip
-        hits = rendering.composite(surface, field.appearance, origins, directions, taken, sampling)
+        marched = kernels.Rays(origins, directions, near, far, torch.full_like(near, 0.5))
+        taken = reference.march(sdf, marched, field.occupancy.states, surface.grid.extent, sampling, _FINE_MOST)
+        hits = reference.composite(sdf, field.appearance.at(sampling.active_radiance), marched, taken, sampling)
         samples += int(hits.samples)
         parts.append(field.shade_hits(hits, origins, directions, camera_x, list(field.sensors), True))
     return _joined(parts), samples / len(rays)
@@ -211,7 +208,7 @@ def termination(bed: Bed) -> list[Way]:
     s = bed.field.sampling
     values = sorted({1.0, 2.0, 3.0, 5.0, 8.0, s.max_optical_depth})
     return [
-        Way(problem, f"max_optical_depth {v:g}{_own(v == s.max_optical_depth)}", names, dataclasses.replace(s, max_optical_depth=v))
+        Way(problem, f"max_optical_depth {v:g}{_own(v == s.max_optical_depth)}", names, s._replace(max_optical_depth=v))
         for problem, names in bed.sets.items()
         for v in values
     ]
@@ -225,7 +222,7 @@ def steps(bed: Bed) -> list[Way]:
         own = getattr(s, name)
         variants += [(f"{name} {v:g}{_own(v == own)}", {name: v}) for v in sorted({*values, own})]
     return [
-        Way(problem, name, names, dataclasses.replace(s, **change))  # type: ignore[arg-type]
+        Way(problem, name, names, s._replace(**change))  # type: ignore[arg-type]
         for problem, names in bed.sets.items()
         for name, change in variants
     ]
@@ -295,8 +292,8 @@ def bench_render(
         "rows": rows,
         "repeats": repeats,
         "rays": len(rays),
-        "sampling": dataclasses.asdict(field.sampling),
-        "reference": dataclasses.asdict(fine(field.sampling)) | {"samples": bed.truth.samples, "doubt": bed.truth.doubt},
+        "sampling": field.sampling._asdict(),
+        "reference": fine(field.sampling)._asdict() | {"samples": bed.truth.samples, "doubt": bed.truth.doubt},
     }
     figure = scatter_panels(rows, ("rays_per_s", "rays/s"), ("error", "error of radiance [full scale]"), "{problem}: {method}")
     columns = (

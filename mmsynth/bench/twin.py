@@ -224,7 +224,7 @@ def _read_bound(signal: np.ndarray, model: NoiseModel) -> float:
 
 
 def spectra() -> list[Method]:
-    """A band of 30 nm put together from N measured bands over 400 to 700 nm: error on smooth random spectra, and the one foretold."""
+    """A band of 30 nm put together from N measured bands over 400 to 700 nm: error on smooth random spectra, and the expected one."""
     nm = np.arange(400.0, 701.0, 2.0)
     apart = 3.0**0.5 * np.abs(nm[:, None] - nm) / SMOOTH_NM
     random = np.random.default_rng(0)
@@ -243,7 +243,7 @@ def spectra() -> list[Method]:
         def judge(found: Any) -> dict[str, float]:
             error = found.weights @ noisy - truth
             relative = float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
-            return {"error": relative, "foretold": found.residual, "noise_gain": found.noise_gain}
+            return {"error": relative, "expected_error": found.residual, "noise_gain": found.noise_gain}
 
         return Method("30 nm at 560 nm", f"{count} bands", lambda: combine(wanted, bands), judge, 1, "of the value")
 

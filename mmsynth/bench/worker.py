@@ -20,7 +20,7 @@ import torch
 from mmsynth.bench.jobs import scene_of
 from mmsynth.bench.machine import peak_memory
 from mmsynth.errors import DivergedError, InputError
-from mmsynth.field.kernels import announce_compilation
+from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -41,7 +41,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """
     device = task["device"]
     if device == "cpu":
-        announce_compilation()
+        warm_up()
     began, cpu = time.perf_counter(), time.process_time()
     scene = scene_of(task)
     length = {"steps": task["steps"], "budget": task["budget"]}
@@ -49,7 +49,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at
-    scores = evaluate(field, load_scene(task["scene"]), scene.split.test)
+    scores = evaluate(field, load_scene(task["scene"]), views=scene.split.test)
     return {
         "seconds": seconds,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),

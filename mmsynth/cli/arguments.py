@@ -16,7 +16,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object 
 SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="scene folder, or `example` for the packaged scene")]
 RecipeOption = Annotated[str | None, typer.Option(help="packaged recipe or TOML file")]
 ModalitiesOption = Annotated[str | None, typer.Option(help="fit these only, e.g. rgb,ms")]
-FramesOption = Annotated[str | None, typer.Option(help="training frames to keep of some modalities, e.g. pol=3,ms=5; default: all")]
+FramesOption = Annotated[
+    str | None, typer.Option(help="number of training frames to keep of some modalities, e.g. pol=3,ms=5; default: all")
+]
 
 
 def modality_names(text: str | None) -> list[str] | None:

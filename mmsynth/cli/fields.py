@@ -134,17 +134,17 @@ def batch(
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
     from mmsynth.operations.output.work_partition import partition_of_environment
-    from mmsynth.workflows.batch import Job, read_scene_list, run_batch
+    from mmsynth.workflows.batch import SceneJob, read_scene_list, run_batch
 
     seconds = fit_length(steps, budget)
     listed, part = read_scene_list(scenes), partition_of_environment()
     names = modality_names(modalities)
-    job = Job(
+    job = SceneJob(
         load_recipe(recipe), steps, seconds, seed, pick_device(device),
         modalities=None if names is None else tuple(names), poses=poses,
         rig=cast("Rig", rig), file_format=cast("DatasetFormat", file_format),
     )  # fmt: skip
-    outcomes = run_batch(listed, out, job, part, say=(lambda text: None) if as_json else print)
+    outcomes = run_batch(listed, out, job, part=part, say=(lambda text: None) if as_json else print)
     if as_json:
         print(json.dumps({"out": str(out), "scenes": outcomes}))
     failed = [name for name, outcome in outcomes.items() if "error" in outcome]
@@ -154,7 +154,7 @@ def batch(
 
 @command("doctor")
 def doctor(as_json: JsonOption = False) -> None:
-    """Versions, threads, GPU, kernels, and what to do."""
+    """Print versions, threads, GPU, state of the compiled kernels, and advice."""
     from mmsynth.bench.doctor import diagnose, render_text
 
     facts = diagnose()

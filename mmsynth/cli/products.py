@@ -28,7 +28,8 @@ def convert(
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
     method: Annotated[str, typer.Option(help="auto, field, ratio or guided")] = "auto",
     images: Annotated[
-        list[Path] | None, typer.Option(help="frames of the source, once per file: found by what they show, or at --poses by their names")
+        list[Path] | None,
+        typer.Option(help="frames of the source without poses, one option for each file; with --poses: matched to the poses by name"),
     ] = None,
     poses: Annotated[
         Path | None, typer.Option(help="poses of the source, as for generate-dataset; without --images the field alone is rendered")
@@ -40,7 +41,7 @@ def convert(
     out: Annotated[Path | None, typer.Option(help="default: RUN/convert/FROM_to_TO")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Another modality at the poses of the frames of one, or at any poses."""
+    """Convert frames of one modality into another, at the frames' poses or at any poses."""
     from mmsynth.operations.conversion.files import convert_files
     from mmsynth.scene.scene import canonical_modality
     from mmsynth.workflows.runs import open_run
@@ -72,16 +73,21 @@ def generate_dataset(
     ] = "aligned",
     modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
     outputs: Annotated[
-        str | None, typer.Option(help="beside the modalities: some of geometry,flow,coverage, or none; default: all", metavar="NAMES")
+        str | None,
+        typer.Option(help="in addition to the modalities: any of geometry,flow,coverage, or none; default: all", metavar="NAMES"),
     ] = None,
     min_coverage: Annotated[
-        float | None, typer.Option(help="leave out views that the training frames cover less; 1 = their own pixels")
+        float | None, typer.Option(help="leave out views whose mean coverage by the training frames is below this, 0 to 1")
     ] = None,
     sensor: Annotated[
-        list[str] | None, typer.Option(help="also raw frames of this sensor file or packaged sensor, once per sensor; into OUT/raw")
+        list[str] | None,
+        typer.Option(help="also simulate raw frames of this sensor (file or packaged name), one option for each; into OUT/raw"),
     ] = None,
     raw: Annotated[
-        bool, typer.Option("--raw", help="also raw frames of the field's own sensors, as calibrate-noise found them (RUN/sensors)")
+        bool,
+        typer.Option(
+            "--raw", help="also simulate raw frames of the field's own sensors, with the noise that calibrate-noise found (RUN/sensors)"
+        ),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="of the raw frames' noise")] = 0,
     out: Annotated[Path | None, typer.Option(help="default: RUN/dataset")] = None,
@@ -90,8 +96,8 @@ def generate_dataset(
     verify: Annotated[bool, typer.Option("--verify", help="only check a finished dataset against its checksums")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """An aligned dataset: every modality, depth, normals, opacity, coverage, flow, intrinsics and pose per view. Under torchrun every
-    process makes its share."""
+    """Render an aligned dataset: every modality, depth, normals, opacity, coverage, flow, intrinsics and pose of each view. Under torchrun
+    every process makes its share."""
     from mmsynth.fitting.device import pick_device
     from mmsynth.operations.dataset import generate as dataset
     from mmsynth.operations.dataset.index import verify_dataset
@@ -136,18 +142,20 @@ def generate_dataset(
 def simulate(
     sensor: Annotated[list[str], typer.Option(help="sensor file, or the name of a packaged one; once per sensor of the rig")],
     poses: Annotated[Path | None, typer.Option(help="of the rig's reference: as for generate-dataset")] = None,
-    views: Annotated[str | None, typer.Option(help="instead: at frames of the scene, train, test, all or ids, e.g. 9,19")] = None,
+    views: Annotated[
+        str | None, typer.Option(help="instead of --poses: frames of the scene: train, test, all, or ids such as 9,19")
+    ] = None,
     run: RunOption = None,
     rig: Annotated[str, typer.Option(help="native: each sensor at its place on the rig; aligned: all at the poses")] = "native",
     delta: Annotated[
-        bool, typer.Option("--delta", help="of captured sensors: apply the file's effects on top of what the field has")
+        bool, typer.Option("--delta", help="instances only: apply the file's effects on top of those that the field has learned")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="of noise and fixed patterns")] = 0,
     file_format: Annotated[str, typer.Option("--format", help="png, tiff or dng")] = "png",
     out: Annotated[Path | None, typer.Option(help="default: RUN/simulated")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The sensor's digital twin: raw frames as it would have recorded them, a scene that can be fitted again."""
+    """Simulate the raw frames of sensors; the result is a scene that can be fitted again."""
     from mmsynth.operations.output.work_partition import partition_of_environment
     from mmsynth.operations.simulation import simulate as twins
     from mmsynth.workflows.runs import open_run
@@ -181,14 +189,14 @@ def calibrate_noise(
     run: RunOption = None,
     modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
     sensor: Annotated[
-        list[str] | None, typer.Option(help="sensor files that say bits, black level and alignment; default: what the frames use")
+        list[str] | None, typer.Option(help="sensor files that give bits, black level and alignment; default: taken from the frames")
     ] = None,
     raw: Annotated[Path | None, typer.Option(help="other frames at the same poses, of any exposure: RAW/MODALITY/0009.png")] = None,
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: those of the training")] = None,
     out: Annotated[Path | None, typer.Option(help="default: RUN/sensors, or sensors")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Gain, read noise and PRNU from photon transfer, into sensor files; from a scene's frames and its field, or from frames alone."""
+    """Measure gain, read noise and PRNU by photon transfer, into sensor files; from a scene's frames and field, or frames alone."""
     from mmsynth.operations.simulation import calibrate_noise as noise
     from mmsynth.report.text import noise_text
     from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
@@ -199,22 +207,19 @@ def calibrate_noise(
     if frames:
         if len(files) != 1:
             raise InputError(f"calibrate-noise: {len(files)} sensor files for these frames, expected one --sensor that describes them.")
-        found, destination = {files[0].name: noise.calibrate_from_frames(files[0], frames)}, out or Path("sensors")
+        destination, calibrated = out or Path("sensors"), {files[0].name: noise.calibrate_from_frames(files[0], frames)}
+        noise.write(calibrated, destination)
     else:
         opened = open_run(run)
-        folder, field, scene = opened.folder, opened.field, opened.scene
-        known = noise.by_modality(files)
+        destination = out or opened.folder / "sensors"
         with progress_bar("noise", as_json) as show:
-            found, failed = noise.calibrate_noise(
-                field, scene, modalities=modality_names(modalities), known=known, raw=raw, views=view_ids(views), progress=show
-            )
-        destination = out or folder / "sensors"
-    if found:
-        noise.write(found, destination)
-        facts = {"out": str(destination), "sensors": {n: c.to_json() for n, c in found.items()}}
-        print(json.dumps(facts) if as_json else noise_text(found))
-        if not as_json:
-            print(f"wrote {destination}/ ({', '.join(f'{n}.toml' for n in found)}, noise.svg)")
+            calibrated, failed = noise.calibrate_noise(
+                opened.field, opened.scene, modalities=modality_names(modalities), known=noise.by_modality(files), raw=raw,
+                views=view_ids(views), out=destination, progress=show,
+            )  # fmt: skip
+    if calibrated:
+        facts = {"out": str(destination), "sensors": {n: c.to_json() for n, c in calibrated.items()}}
+        print(json.dumps(facts) if as_json else noise_text(calibrated, destination))
     if failed:
         raise InputError(" ".join(failed.values()))
 
@@ -225,16 +230,18 @@ def mesh(
     resolution: Annotated[int, typer.Option(min=8, max=8192, help="cells across the region of interest")] = 256,
     out: Annotated[Path | None, typer.Option(help="PLY, GLB, OBJ or STL; default: RUN/mesh.ply")] = None,
     closed: Annotated[bool, typer.Option("--closed", help="close the surface where the region's border cuts it")] = False,
-    keep: Annotated[str, typer.Option(help="components: clean (no specks), all, largest, or how many")] = "clean",
-    min_views: Annotated[int, typer.Option(min=0, help="keep components only that so many training views see")] = 0,
+    keep: Annotated[str, typer.Option(help="components to keep: clean (all but specks), all, largest, or a number")] = "clean",
+    min_views: Annotated[int, typer.Option(min=0, help="keep only components that this many training views see")] = 0,
     faces: Annotated[int | None, typer.Option(min=4, help="decimate to so many")] = None,
-    max_error: Annotated[float | None, typer.Option(help="or as far as 99.9 % of it stays that near [unit]")] = None,
+    max_error: Annotated[
+        float | None, typer.Option(help="or decimate while 99.9 % of the surface stays within this distance [scene unit]")
+    ] = None,
     geometry_only: Annotated[bool, typer.Option("--geometry-only", help="no colours and no modalities on the vertices")] = False,
     against: Annotated[Path | None, typer.Option(help="score it against this mesh, in the same frame and unit")] = None,
     distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002; default: 0.5, 1 and 2 % of the radius")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The surface with every modality on it, in the input's frame and unit."""
+    """Extract the surface as a mesh with every modality on its vertices, in the input's frame and unit."""
     from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
     from mmsynth.report.text import mesh_text
     from mmsynth.workflows.runs import open_field, open_run

@@ -1,4 +1,4 @@
-"""Encodings: the multiresolution hash grid of positions, and spherical harmonics of directions."""
+"""The multiresolution hash grid of positions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
-from mmsynth.field.kernels.cpu.blocks import FEATURES
+from mmsynth.field.kernels.constants import FEATURES
 
 _START = 1e-4  # features of a new level are that small
 
@@ -66,26 +66,14 @@ class HashGrid(nn.Module):
 
     def forward(self, positions: Tensor, active: int) -> Tensor:
         """(N, 3) → (N, width); levels from ``active`` on are zero and cost nothing."""
-        unit = (positions * (0.5 / self.extent) + 0.5).clamp(0.0, 1.0)
-        return kernels.hash_encode(unit, self.table, self.resolutions, self.offsets, active)
+        return kernels.reference.encode(positions, self.at(active), kernels.hash_encode)
+
+    def at(self, active: int) -> kernels.GridTable:
+        """What the kernels take, with so many active levels at most."""
+        return kernels.GridTable(self.table, self.resolutions, self.offsets, self.extent, min(active, len(self.resolutions)))
 
 
 def _offsets(resolutions: list[int], rows_log2: int | Sequence[int]) -> Tensor:
     most = [rows_log2] * len(resolutions) if isinstance(rows_log2, int) else rows_log2
     rows = [min((r + 1) ** 3, 2**m) for r, m in zip(resolutions, most, strict=True)]
     return torch.tensor([sum(rows[:i]) for i in range(len(rows) + 1)])
-
-
-def spherical_harmonics(d: Tensor) -> Tensor:
-    """Real spherical harmonics up to degree 3 (orthonormal), (N, 3) unit vectors → (N, 16)."""
-    x, y, z = d.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    return torch.stack([
-        torch.full_like(x, 0.28209479177387814),
-        0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x,
-        1.0925484305920792 * x * y, 1.0925484305920792 * y * z, 0.31539156525252005 * (3 * zz - 1),
-        1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
-        0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z, 0.4570457994644658 * y * (5 * zz - 1),
-        0.3731763325901154 * z * (5 * zz - 3), 0.4570457994644658 * x * (5 * zz - 1), 1.445305721320277 * z * (xx - yy),
-        0.5900435899266435 * x * (xx - 3 * yy),
-    ], -1)  # fmt: skip

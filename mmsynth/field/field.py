@@ -1,29 +1,23 @@
-"""The field of a scene: what is learned by a fit and asked by every operation."""
+"""The field of a scene: learned by a fit, rendered by every operation."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
+from mmsynth.field.kernels import Sampling
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
-from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
-from mmsynth.files import read_json, write_atomic, write_json
 from mmsynth.scene.scene import Frame, Region, Sensor
-from mmsynth.scene.serialisation import camera_from_json, camera_to_json, sensor_from_json, sensor_to_json
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import reference_axes
 
@@ -219,7 +213,7 @@ class Field(nn.Module):
             points = origins[hit] + directions[hit] * depth[hit, None]
             slope = self.surface.gradient(self.surface.grid.to_grid(points), epsilon, self.sampling.active_surface)
             if self.surface.grid.extent > 1.0:
-                slope = kernels.reference.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
+                slope = kernels.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
             normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
             out["normal"] = normal
         return out
@@ -296,61 +290,3 @@ class Field(nn.Module):
             if name not in self.sensors:
                 raise InputError(f"modality {name!r}: not in this field, expected one of {', '.join(self.sensors)}.")
         return names
-
-    def save(self, run: Path) -> None:
-        """Write ``field.safetensors`` and ``manifest.json`` into the run folder, each atomically, the manifest last."""
-        tensors = {k: v.detach().cpu().contiguous() for k, v in self.state_dict().items()}
-        content = save(tensors)
-        write_atomic(run / "field.safetensors", lambda path: path.write_bytes(content))
-        self.manifest["field"] = {
-            "design": asdict(self.design),
-            "sampling": asdict(self.sampling),
-            "radiance_scale": self.radiance_scale,
-            "view_dependence": self.view_dependence,
-            "region": asdict(self.region),
-            "unit": self.unit,
-            "sensors": [sensor_to_json(s) for s in self.sensors.values()],
-            "cameras": {n: camera_to_json(c) for n, c in self.cameras.items()},
-            "rig": {n: m.tolist() for n, m in self.rig.items()},
-            "corrections": {
-                "views": {str(v): m.tolist() for v, m in self.corrections.views.items()},
-                "sensors": {n: m.tolist() for n, m in self.corrections.sensors.items()},
-            },
-        }
-        self.manifest["saved"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        write_json(run / "manifest.json", self.manifest)
-
-    @staticmethod
-    def load(run: Path, device: str = "cpu") -> Field:
-        """Read a finished run.
-
-        Raises:
-            InputError: no such run, or a file of it is missing, broken or of another version.
-        """
-        run = Path(run)
-        if not (run / "manifest.json").is_file():
-            raise InputError(f"{run}: holds no finished fit (no manifest.json); run `mmsynth fit SCENE` first.")
-        manifest = read_json(run / "manifest.json")
-        try:
-            stored = manifest["field"]
-            sensors = {s["name"]: sensor_from_json(s) for s in stored["sensors"]}
-            region = Region(tuple(stored["region"]["centre"]), stored["region"]["radius"])
-            cameras = {n: camera_from_json(c) for n, c in stored["cameras"].items()}
-            rig = {n: np.array(m) for n, m in stored["rig"].items()}
-            sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored["design"].items()}
-            field = Field(Design(**sizes), sensors, stored["radiance_scale"], region, stored["unit"], cameras, rig)
-            field.sampling = Sampling(**stored["sampling"])
-            field.view_dependence = dict(stored["view_dependence"])
-            moved = stored["corrections"]
-            field.corrections = Corrections(
-                {int(v): np.array(m) for v, m in moved["views"].items()}, {n: np.array(m) for n, m in moved["sensors"].items()}
-            )
-            field.load_state_dict(load_file(run / "field.safetensors"))
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{run / 'manifest.json'}: not the manifest of a fit of this version ({error}).") from error
-        except (OSError, SafetensorError, RuntimeError) as error:
-            raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
-        field.manifest = manifest
-        if device == "cpu":
-            kernels.announce_compilation()  # a run may have been fitted on another machine
-        return field.to(device)

@@ -1,13 +1,12 @@
-"""Radiance: appearance features in space, composited along the ray and shaded once per ray, with a head per modality."""
+"""Radiance: appearance features in space, composited along the ray and shaded once per ray, with one head for each modality."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
 
 from mmsynth.field import kernels
-from mmsynth.field.encoding import spherical_harmonics
+from mmsynth.field.kernels.constants import HARMONICS
 from mmsynth.scene.scene import Sensor
 from mmsynth.sensors.polarization import coherency_from_factor
 
@@ -21,11 +20,9 @@ class Shader(nn.Module):
     as fast as bright ones.
     """
 
-    term_degree: Tensor
-
     def __init__(self, features: int, hidden: int, sensors: dict[str, Sensor], radiance_scale: dict[str, float]) -> None:
         super().__init__()
-        self.trunk = nn.Sequential(nn.Linear(features + 16, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
+        self.trunk = nn.Sequential(nn.Linear(features + HARMONICS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU())
         self.columns: dict[str, slice] = {}
         width = 0
         for name, sensor in sensors.items():
@@ -33,7 +30,6 @@ class Shader(nn.Module):
             width = self.columns[name].stop
         self.heads = nn.Linear(hidden, width)
         self.radiance_scale = radiance_scale
-        self.register_buffer("term_degree", torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7), persistent=False)
 
     def forward(self, features: Tensor, directions: Tensor, degree: Tensor | int) -> Tensor:
         """(R, F), (R, 3) → (R, outputs of all modalities), before the functions that make them light.
@@ -41,18 +37,15 @@ class Shader(nn.Module):
         Args:
             degree: of the spherical harmonics of the direction that are seen, 0 = none; one number, or (R,) int64.
         """
-        if isinstance(degree, int) and kernels.on_cpu(features) and not torch.is_grad_enabled():
-            return kernels.cpu.shade(self, features, directions, degree)
-        return self.heads(self.hidden(features, directions, degree))
+        return kernels.shade(self.weights(), features, directions, degree)
 
-    def hidden(self, features: Tensor, directions: Tensor, degree: Tensor | int) -> Tensor:
-        """The last hidden layer, (R, H), which all modalities share."""
-        seen = self.term_degree <= (degree if isinstance(degree, int) else degree[:, None])
-        return self.trunk(torch.cat([features, spherical_harmonics(directions) * seen], -1))
+    def weights(self) -> kernels.ShaderWeights:
+        """What the kernels take."""
+        return kernels.ShaderWeights(*self.parameters())  # in the order of the layers, weights before biases
 
     def values(self, modality: str, outputs: Tensor) -> Tensor:
         """All channels of one radiance modality, linear and ≥ 0: (R, outputs) → (R, C)."""
-        return radiance(outputs[:, self.columns[modality]]) * self.radiance_scale[modality]
+        return kernels.radiance(outputs[:, self.columns[modality]]) * self.radiance_scale[modality]
 
     def polarized(self, modality: str, outputs: Tensor, x: Tensor, y: Tensor, angles: Tensor) -> tuple[Tensor, Tensor]:
         """All channels of one polarization modality, I = eᵀ J e behind analysers that all rays share, and the Stokes vectors.
@@ -68,14 +61,3 @@ class Shader(nn.Module):
         behind = (torch.cos(angles)[:, None, None] * across + torch.sin(angles)[:, None, None] * up).square().sum(-1).T
         xx, yy, xy = across.square().sum(-1), up.square().sum(-1), (across * up).sum(-1)
         return behind * self.radiance_scale[modality], torch.stack([xx + yy, xx - yy, 2.0 * xy], -1) * self.radiance_scale[modality]
-
-
-def radiance(raw: Tensor) -> Tensor:
-    """Outputs of a radiance head → relative radiance > 0."""
-    return softplus(raw)
-
-
-def intensity(raw: Tensor, axes: Tensor) -> Tensor:
-    """Outputs (..., 6) of a polarization head → relative intensity behind analysers with axes (..., 3): (...)."""
-    # |Lᵀ e|² is eᵀ (L Lᵀ) e without a chance of becoming negative by rounding
-    return (coherency_from_factor(raw).mT @ axes[..., None])[..., 0].square().sum(-1)

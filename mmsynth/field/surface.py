@@ -29,22 +29,15 @@ class Surface(nn.Module):
         w = layer.weight.detach()
         self.hidden = nn.Parameter(torch.cat([w[:, -3:], layer.bias.detach()[:, None], w[:, :-3]], 1))
         self.output_weight = nn.Parameter(torch.zeros(hidden + 1))
-        self.spheres = np.array(spheres, np.float32)
+        self.inner_radius, self.outer_radius = (float(np.float32(r)) for r in spheres)
 
     def forward(self, positions: Tensor, active: int) -> Tensor:
         """Signed distance, positive outside: (N, 3) → (N,)."""
-        return kernels.surface_value(self, positions, active)
+        return kernels.surface_value(positions, *self.at(active))
 
-    def reference(self, positions: Tensor, active: int) -> Tensor:
-        """``forward`` in torch, with autograd, on any device and in any precision."""
-        ones = torch.ones_like(positions[:, :1])
-        hidden = torch.relu(torch.cat([positions, ones, self.grid(positions, active)], -1) @ self.hidden.T)
-        norm = torch.linalg.vector_norm(positions, dim=-1)
-        return (
-            hidden @ self.output_weight[:-1]
-            + self.output_weight[-1]
-            + torch.minimum(norm - float(self.spheres[0]), float(self.spheres[1]) - norm)
-        )
+    def at(self, active: int) -> tuple[kernels.GridTable, kernels.SurfaceNetwork]:
+        """What the kernels take, with so many active levels at most."""
+        return self.grid.at(active), kernels.SurfaceNetwork(self.hidden, self.output_weight, self.inner_radius, self.outer_radius)
 
     def gradient(self, positions: Tensor, epsilon: float, active: int) -> Tensor:
         """∇sdf by four-tap differences of size ``epsilon`` (Neuralangelo, Li et al. 2023): (N, 3) → (N, 3)."""

@@ -1,4 +1,4 @@
-"""What residuals say in the middle of a fit: how far radiance depends on the direction, and whether frames were exposed differently.
+"""Two questions that residuals answer during a fit: how far radiance depends on direction, and whether exposures differ between frames.
 
 Rays of all frames are compared with what was measured. Half of them may be learned from, the other half judges.
 """
@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting import losses
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.optimiser import Adam
@@ -51,16 +50,14 @@ class Residuals:
 
 
 @torch.no_grad()
-def decide(
-    field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: rendering.Sampling, seed: int
-) -> Decisions:
+def decide(field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
     """Put the residuals of a field as it is to the tests of this module."""
     random = np.random.default_rng((seed, 2))
     batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random, field.device)
     jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
     outputs = field.shader(hits.features, batch.directions, batch.per_ray(field.view_dependence))
-    predicted = losses.predict(outputs, hits.opacity, batch)
+    predicted = kernels.predict(outputs, hits.opacity, batch.measured)
     if recipe.view_dependence == "auto":
         errors = errors_by_degree(field.shader, hits.features, hits.opacity, batch)
         degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in batch.parts}
@@ -113,10 +110,10 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
         optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
         for step in range(_STEPS + 1):
             with torch.enable_grad():
-                predicted = losses.predict(candidate(features, batch.directions, degree), opacity, batch)
-                difference = losses.residual(predicted, batch)
+                predicted = kernels.predict(candidate(features, batch.directions, degree), opacity, batch.measured)
+                difference = kernels.residual(predicted, batch.measured)
                 if step < _STEPS:
-                    losses.photometric(difference * learned, batch).backward()
+                    kernels.photometric(difference * learned, batch.measured).backward()
                     optimiser.step(1.0 - step / _STEPS)
         for name, (_, numbers) in batch.parts.items():
             judged = (~learned & usable)[numbers]

@@ -1,4 +1,4 @@
-"""The pixels to learn from, in memory as they were stored, and random batches of them as rays."""
+"""The training pixels, in memory as they were stored, and random batches of them as rays."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
+from mmsynth.field import kernels
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
@@ -46,6 +47,11 @@ class Batch:
     frame: Tensor
     parts: dict[str, tuple[slice, slice]]
     alpha: Tensor
+
+    @property
+    def measured(self) -> kernels.Measured:
+        """What was measured along the rays, as the kernels take it."""
+        return kernels.Measured(self.target, self.ray, self.output, self.axes, self.level, self.saturation, self.weight)
 
     def per_ray(self, values: Mapping[str, float]) -> Tensor:
         """A value for each modality → one for each ray, (R,)."""

@@ -1,4 +1,4 @@
-"""Whether and when poses are refined: decided by evidence, then Gauss-Newton steps between the steps of the fit."""
+"""Refinement of poses: whether it is worth it, then Gauss-Newton steps between the steps of the fit."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import torch
 from pydantic import TypeAdapter
 from torch import Tensor
 
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Corrections, Field
-from mmsynth.fitting import losses
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements, in_order
@@ -43,7 +42,7 @@ class MotionDecisions:
 
 
 def ray_residuals(
-    field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, far_light: bool, sampling: rendering.Sampling
+    field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, far_light: bool, sampling: kernels.Sampling
 ) -> RayJacobian:
     """Residuals of rays, the mean over what was measured along each, in units of the modality's level, and their derivatives.
 
@@ -58,8 +57,8 @@ def ray_residuals(
         with torch.enable_grad():
             hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
             features, opacity = field.with_far_light(hits) if far_light else (hits.features, hits.opacity)
-            predicted = losses.predict(field.shader(features, directions, degrees), opacity, batch)
-            relative = losses.residual(predicted if gain is None else predicted * gain, batch) / batch.level
+            predicted = kernels.predict(field.shader(features, directions, degrees), opacity, batch.measured)
+            relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.level
             mean = torch.zeros_like(middle).index_add(0, batch.ray, relative) / torch.bincount(batch.ray, minlength=len(origins))
             gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
     finally:

@@ -8,15 +8,15 @@ import platform
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from mmsynth.field import kernels
 from mmsynth.field.field import Field
+from mmsynth.field.storage import save_field
+from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_text
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
 from mmsynth.fitting.needs import Needs
@@ -64,7 +64,7 @@ def fit(
         if steps is None and budget is None:
             budget = _BUDGET
     if device == "cpu":
-        kernels.announce_compilation()
+        warm_up()
     trainer = Trainer(scene, recipe if isinstance(recipe, Recipe) else load_recipe(recipe), steps, budget, seed, device)
     log: list[str] = []
     if saved is not None:
@@ -99,7 +99,7 @@ def fit(
     _save(run, trainer, log)
     field = _finished(trainer)
     field.manifest = _manifest(trainer, scene)
-    field.save(run)
+    save_field(field, run)
     return field
 
 
@@ -113,7 +113,7 @@ def _finished(trainer: Trainer) -> Field:
     field = trainer.field
     trainer.average.apply()
     last = sampling_at(1.0, trainer.recipe, trainer.needs)
-    field.sampling = replace(last, step=last.step * trainer.recipe.sampling.rendered_step_factor)
+    field.sampling = last._replace(step=last.step * trainer.recipe.sampling.rendered_step_factor)
     field.occupancy.update(
         lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
     )

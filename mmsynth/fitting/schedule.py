@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels import Sampling
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
 
@@ -37,7 +37,7 @@ def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
     """Beyond some sharpness the surface's rates fall in proportion to the width of the soft surface.
 
     A step of Adam moves the surface by about its rate, whatever the gradient. Where that is a good part of the soft surface,
-    the surface never comes to rest: colours blur, and views stop to agree.
+    the surface never settles: colours blur and views disagree.
     """
     return min(1.0, recipe.schedule.full_rate_sharpness / sharpness)
 

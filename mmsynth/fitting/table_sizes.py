@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from mmsynth.field.field import Field
-from mmsynth.field.kernels import SHELL
-from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels import SHELL, Sampling
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.recipe import RadianceRecipe, Recipe, SurfaceRecipe
 

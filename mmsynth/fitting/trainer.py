@@ -14,7 +14,7 @@ import torch
 from pydantic import TypeAdapter
 
 from mmsynth.errors import DivergedError, InputError
-from mmsynth.field import rendering
+from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
 from mmsynth.fitting import losses
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
@@ -164,18 +164,18 @@ class Trainer:
         state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
         state.step += 1
 
-    def _loss(self, batch: Batch, sampling: rendering.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
+    def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
         recipe, field = self.recipe, self.field
         origins, directions = batch.origins, batch.directions
         jitter = torch.rand(len(origins), generator=generator).to(self.device)
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
         degrees = batch.per_ray(field.view_dependence)
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
-        teaches = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
+        trains_geometry = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
         gain = self._gain_of(batch)
         # light from beyond the region would explain what is in it as long as that has no shape
         shaded = field.with_far_light(hits) if self.state.decided is not None else (hits.features, hits.opacity)
-        loss, squared = losses.compare(field.shader, *shaded, batch, degrees, teaches, gain)
+        loss, squared = losses.compare(field.shader, *shaded, batch, degrees, trains_geometry, gain)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_alpha:
             known = torch.isfinite(batch.alpha)
@@ -199,7 +199,7 @@ class Trainer:
         """Exposure of each number's frame, (M,); None where no gains were needed."""
         return self._gain()[batch.frame] if self._has_gains else None
 
-    def _look(self, sampling: rendering.Sampling, rays: dict[str, int], random: np.random.Generator) -> RayJacobian:
+    def _look(self, sampling: kernels.Sampling, rays: dict[str, int], random: np.random.Generator) -> RayJacobian:
         batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
         far_light = self.state.decided is not None
         return ray_residuals(self.field, batch, batch.per_ray(self.field.view_dependence), self._gain_of(batch), far_light, sampling)
@@ -217,10 +217,10 @@ class Trainer:
 
     def _gradients(
         self,
-        hits: rendering.Hits,
+        hits: kernels.Hits,
         origins: torch.Tensor,
         directions: torch.Tensor,
-        sampling: rendering.Sampling,
+        sampling: kernels.Sampling,
         generator: torch.Generator,
     ) -> torch.Tensor:
         """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""

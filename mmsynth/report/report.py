@@ -1,4 +1,4 @@
-"""One self-contained HTML page per run: what the scene needed, how the fit went, what it can do. No script, no network, no other file."""
+"""One self-contained HTML page per run: decisions, curve, test views, scores. No script, no network, no other file."""
 
 from __future__ import annotations
 

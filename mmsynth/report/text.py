@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -63,9 +64,10 @@ def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
-    """The result of ``calibrate-noise``: one row per sensor, with standard deviations; "<": not told, and what would have been seen;
-    "–": one frame alone tells no pattern. Exposure: the frames' median, in units of what the field learned."""
+def noise_text(calibrated: Mapping[str, Calibrated], out: Path) -> str:
+    """The result of ``calibrate-noise``, written to ``out``: one row per sensor, with standard deviations; "<": too small
+    to be measured, and the least that would have been; "–": one frame alone shows no pattern.
+    Exposure: the frames' median, in units of what the field learned."""
     lines = [
         f"{'sensor':14s}{'frames':>7s}{'exposure':>9s}{'bits':>5s}{'gain [DN/e-]':>20s}{'full scale [e-]':>18s}{'read [e-]':>14s}"
         f"{'PRNU [%]':>14s}"
@@ -83,7 +85,8 @@ def noise_text(calibrated: Mapping[str, Calibrated]) -> str:
             f"{pair(full, full * p.gain_sd / p.gain_dn_e, 0):>18s}{pair(p.read_e, p.read_sd, 1):>14s}"
             f"{pair(100 * p.prnu, 100 * p.prnu_sd, 2):>14s}"
         )
-    return "\n".join(lines)
+    files = ", ".join(f"{name}.toml" for name in calibrated)
+    return "\n".join([*lines, f"wrote {out}/ ({files}, noise.svg)"])
 
 
 def mesh_text(report: Mapping[str, Any]) -> str:

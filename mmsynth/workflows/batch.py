@@ -10,6 +10,7 @@ from typing import Any
 
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field
 from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -23,8 +24,8 @@ from mmsynth.scene.scene import Scene
 
 
 @dataclass(frozen=True)
-class Job:
-    """What is made of every scene.
+class SceneJob:
+    """What is made of each scene of a batch.
 
     Attributes:
         recipe: of the fits. steps, seconds: their length, one of the two or neither (the recipe's). modalities: names, None: all.
@@ -65,7 +66,7 @@ def read_scene_list(path: Path) -> list[Path]:
 
 
 def run_batch(
-    scenes: Sequence[Path], out: Path, job: Job, part: WorkPartition | None = None, say: Callable[[str], None] = lambda text: None
+    scenes: Sequence[Path], out: Path, job: SceneJob, *, part: WorkPartition | None = None, say: Callable[[str], None] = lambda text: None
 ) -> dict[str, dict[str, Any]]:
     """Fit every scene and make its dataset, into ``<out>/NAME/run`` and ``<out>/NAME/dataset``; NAME/outcome.json says how it went.
 
@@ -81,7 +82,7 @@ def run_batch(
         scene, name = scenes[index], scenes[index].resolve().name
         began = time.perf_counter()
         try:
-            outcome = _one(scene, out / name, job)
+            outcome = _fit_and_generate(scene, out / name, job)
             shown = ", ".join(f"{n} {v:.1f}" for n, v in outcome["train_psnr"].items())
             say(f"{name}: {shown} dB on training pixels, {time.perf_counter() - began:.0f} s")
         except (InputError, DivergedError) as error:
@@ -95,7 +96,7 @@ def run_batch(
     return outcomes
 
 
-def _one(path: Path, out: Path, job: Job) -> dict[str, Any]:
+def _fit_and_generate(path: Path, out: Path, job: SceneJob) -> dict[str, Any]:
     scene = load_scene(path, modalities=job.modalities)
     run = out / "run"
     field = _fitted(scene, run, job)
@@ -108,9 +109,9 @@ def _one(path: Path, out: Path, job: Job) -> dict[str, Any]:
     return {"run": str(run), "dataset": None if made is None else str(made), "train_psnr": field.manifest["train_psnr"]}
 
 
-def _fitted(scene: Scene, run: Path, job: Job) -> Field:
+def _fitted(scene: Scene, run: Path, job: SceneJob) -> Field:
     if (run / "manifest.json").is_file():
-        return Field.load(run, local_device(job.device))
+        return load_field(run, local_device(job.device))
     resume = (run / "checkpoint/state.pt").is_file()
     device = local_device(job.device)
     field = fit(scene, run, recipe=job.recipe, steps=job.steps, budget=job.seconds, seed=job.seed, device=device, resume=resume)

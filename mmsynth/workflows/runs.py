@@ -12,6 +12,7 @@ from typing import Any
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 
@@ -39,7 +40,7 @@ def open_field(folder: Path | None = None, *, device: str = "cpu") -> tuple[Path
         InputError: there is no such run, or nothing was fitted in the working folder.
     """
     folder = folder or latest_run()
-    return folder, Field.load(folder, device)
+    return folder, load_field(folder, device)
 
 
 def open_run(folder: Path | None = None, *, device: str = "cpu") -> Run:

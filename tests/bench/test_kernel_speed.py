@@ -11,8 +11,8 @@ import torch
 
 from mmsynth.bench import kernels as bench
 from mmsynth.bench.kernels import OPERATIONS, Operation, available_backends, bench_kernels, time_operation
-from mmsynth.field import kernels
 from mmsynth.field.kernels import cpu
+from mmsynth.field.warmup import warm_up
 
 
 @pytest.fixture(autouse=True)
@@ -105,13 +105,13 @@ def test_rays_of_another_length_are_counted_and_left_out() -> None:
 
 
 def test_what_is_compiled_ahead_is_all_that_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    kernels.announce_compilation()
+    warm_up()
     assert cpu.is_compiled()
     state = torch.get_rng_state()
-    before = [list(k.signatures) for k in cpu._KERNELS]
-    kernels.announce_compilation.__wrapped__()
+    before = [list(k.signatures) for k in cpu.KERNELS]
+    warm_up.__wrapped__()
     assert capsys.readouterr().err == "" and torch.equal(torch.get_rng_state(), state)
     for operation in OPERATIONS:
         if "numba" in operation.calls:
             time_operation(operation, {"torch": "cpu", "numba": "cpu"}, 300, 1.0)
-    assert [list(k.signatures) for k in cpu._KERNELS] == before and all(len(s) == 1 for s in before)
+    assert [list(k.signatures) for k in cpu.KERNELS] == before and all(len(s) == 1 for s in before)

@@ -15,7 +15,7 @@ from mmsynth.bench import render as bench
 from mmsynth.bench.render import FAMILIES, Rays, bench_render, difference, fine, rays_of, truth_of
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels import Sampling
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera
 
@@ -129,7 +129,7 @@ def test_the_reference_is_what_the_kernel_nears_and_is_not_cut_off(field: Field,
     finally:
         field.sampling = fused
     assert truth.samples < 96 and difference(found, truth.outputs, list(SENSORS))["error"] < 1e-4
-    long = replace(fused, step=fused.step / 8)
+    long = fused._replace(step=fused.step / 8)
     field.sampling = long
     try:
         assert truth_of(field, rays).samples > truth.samples

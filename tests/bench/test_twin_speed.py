@@ -54,9 +54,9 @@ def test_calibration_gets_better_with_frames_and_with_short_exposures(rows: list
     assert of_model["gain"] < 0.1 and of_model["read"] < 0.25
 
 
-def test_errors_of_virtual_channels_are_foretold(rows: list[dict[str, Any]]) -> None:
+def test_errors_of_virtual_channels_are_as_expected(rows: list[dict[str, Any]]) -> None:
     for row in _of(rows, "spectra"):
-        assert row["error"] == pytest.approx(row["foretold"], rel=0.1)
+        assert row["error"] == pytest.approx(row["expected_error"], rel=0.1)
 
 
 def test_an_unknown_family_is_refused(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ Whether Triton compiles or interprets is decided when it is first imported. So t
 this file runs a second time, with TRITON_INTERPRET=1 and CPU tensors in the place of CUDA tensors.
 """
 
+import importlib
 import importlib.util
 import os
 import subprocess
@@ -15,9 +16,11 @@ import torch
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
-from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, cuda, reference
+from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, Rays, Sampling, cpu, cuda, reference
+from mmsynth.field.kernels.constants import LEAST_ADVANCE, MAX_SAMPLES_PER_RAY
+from mmsynth.field.kernels.cuda import encoding, marching, sections, shared
 from mmsynth.field.occupancy import Occupancy
-from mmsynth.field.rendering import HORIZON, Sampling, ball_interval, trace_by_parts
+from mmsynth.field.rendering import FARTHEST, ball_interval
 from mmsynth.field.surface import Surface
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -56,7 +59,7 @@ def test_values_in_the_interpreter() -> None:
 
 def _module_without_triton(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.setitem(sys.modules, "triton", None)  # an import of it now fails
-    spec = importlib.util.spec_from_file_location("cuda_without_triton", cuda.__file__)
+    spec = importlib.util.spec_from_file_location("cuda_without_triton", shared.__file__)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -73,7 +76,7 @@ def test_availability_has_a_reason_of_one_line(monkeypatch: pytest.MonkeyPatch) 
     can, why = cuda.available()
     assert can is (why == "") and "\n" not in why
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(cuda, "triton", object())
+    monkeypatch.setattr(shared, "triton", object())
     assert cuda.available() == (False, "torch sees no CUDA device")
 
 
@@ -83,7 +86,7 @@ def test_a_broken_toolchain_is_a_reason_not_an_error(monkeypatch: pytest.MonkeyP
         raise RuntimeError("Failed to find C compiler.\nPlease specify one.")
 
     monkeypatch.setattr(torch, "zeros", fail)
-    assert cuda._probe.__wrapped__() == (False, "no triton kernel can be run: Failed to find C compiler.")
+    assert shared._probe.__wrapped__() == (False, "no triton kernel can be run: Failed to find C compiler.")
 
 
 class _OnGpu:
@@ -103,7 +106,8 @@ def test_the_backend_follows_the_tensor_and_what_is_missing_is_said_once(
     try:
         assert [kernels._backend(_OnGpu(torch.float32)) for _ in range(3)] == [cuda if can else reference] * 3
         assert capsys.readouterr().err == ("" if can else "GPU kernels unavailable (no compiler): using torch operations\n")
-        assert kernels._backend(_OnGpu(torch.float64)) is kernels._backend(torch.ones(1)) is reference
+        assert kernels._backend(_OnGpu(torch.float64)) is kernels._backend(torch.ones(1).double()) is reference
+        assert kernels._backend(torch.ones(1)) is cpu
     finally:
         kernels._on_gpu.cache_clear()
 
@@ -243,11 +247,13 @@ def test_surface_value_equals_the_network(device: str, hidden: int, active: int,
     torch.nn.init.normal_(surface.grid.table)
     torch.nn.init.normal_(surface.output_weight)
     positions = (2.2 * torch.rand(200, 3, device=device) - 1.1) * extent  # some are outside
-    found = cuda.surface_value(surface, positions, active)
-    expected = surface.double().reference(positions.double(), active)
+    with torch.no_grad():
+        found = cuda.surface_value(positions, *surface.at(active))
+    expected = reference.surface_value(positions.double(), *surface.double().at(active))
     torch.testing.assert_close(found.double(), expected, atol=1e-3, rtol=0)  # float32 cell fractions at 300 cells
     assert not found.requires_grad
-    assert cuda.surface_value(surface.float(), positions[:0], active).shape == (0,)
+    with torch.no_grad():
+        assert cuda.surface_value(positions[:0], *surface.float().at(active)).shape == (0,)
 
 
 FIELDS = {
@@ -280,7 +286,7 @@ def _rays(count: int, extent: float, device: str) -> list[torch.Tensor]:
     directions[4:7] = -torch.eye(3)
     origins[4:7] = 2.0 * torch.eye(3) + 0.05
     directions[7] *= -1
-    near, far = ball_interval(origins, directions) if extent == 1.0 else (torch.zeros(count), torch.full((count,), HORIZON))
+    near, far = ball_interval(origins, directions) if extent == 1.0 else (torch.zeros(count), torch.full((count,), FARTHEST))
     return [x.to(device) for x in (origins, directions, near, far, torch.rand(count))]
 
 
@@ -292,8 +298,8 @@ def _rays(count: int, extent: float, device: str) -> list[torch.Tensor]:
 def test_march_equals_reference(device: str, field: str, states: str, step: float, extent: float) -> None:
     rays, grid = _rays(50, extent, device), _states(states, extent).to(device)
     sampling = Sampling(sharpness=60.0, step=step, active_surface=1, active_radiance=1, max_optical_depth=2.0)
-    t, ray, offsets = cuda.march(FIELDS[field], *rays, grid, extent, sampling)
-    t64, ray64, offsets64 = reference.march(FIELDS[field], *(x.double() for x in rays), grid, extent, sampling)
+    t, ray, offsets = cuda.march(FIELDS[field], Rays(*rays), grid, extent, sampling)
+    t64, ray64, offsets64 = reference.march(FIELDS[field], Rays(*(x.double() for x in rays)), grid, extent, sampling)
     assert (t.dtype, ray.dtype, offsets.dtype) == (torch.float32, torch.int64, torch.int64)
     assert torch.equal(ray, torch.repeat_interleave(torch.arange(50, device=device), offsets.diff())) and offsets[0] == 0
     # a sample within rounding of a cell's face may fall either way, and with it the rest of its ray
@@ -309,7 +315,7 @@ def test_march_from_afar_comes_to_an_end(device: str) -> None:
     states = torch.full((7, 7, 7), OUTSIDE, dtype=torch.uint8, device=device)
     states[:, :, 5:] = SHELL
     sampling = Sampling(sharpness=60.0, step=1e-4, active_surface=1, active_radiance=1)
-    t, _, _ = cuda.march(FIELDS["sphere"], *rays, states, 1.0, sampling)
+    t, _, _ = cuda.march(FIELDS["sphere"], Rays(*rays), states, 1.0, sampling)
     assert len(t) and bool((t > 5e4 + 0.42).all())
 
 
@@ -318,7 +324,7 @@ def test_march_without_rays_and_without_hits(device: str) -> None:
     for count in (0, 9):
         rays = _rays(max(count, 8), 1.0, device)
         empty = torch.full((4, 4, 4), OUTSIDE, dtype=torch.uint8, device=device)
-        t, ray, offsets = cuda.march(FIELDS["sphere"], *(x[:count] for x in rays), empty, 1.0, sampling)
+        t, ray, offsets = cuda.march(FIELDS["sphere"], Rays(*(x[:count] for x in rays)), empty, 1.0, sampling)
         assert t.shape == ray.shape == (0,) and offsets.tolist() == [0] * (count + 1)
 
 
@@ -327,7 +333,6 @@ def test_a_trace_on_these_kernels(device: str, extent: float, monkeypatch: pytes
     """March, surface, sections and encoding together, with the gradients of all parameters and of the rays."""
     if device == "cpu":
         monkeypatch.setattr(kernels, "_backend", lambda tensor: cuda if tensor.dtype == torch.float32 else reference)
-        monkeypatch.setattr(kernels, "on_cpu", lambda tensor: False)
     surface, appearance = Surface(HashGrid(3, 8, 3, 12, extent), 8, (0.5, 1.7 * extent)), HashGrid(2, 8, 3, 9, extent)
     torch.nn.init.normal_(surface.grid.table, std=0.1)
     torch.nn.init.normal_(surface.output_weight, std=0.1)
@@ -338,10 +343,11 @@ def test_a_trace_on_these_kernels(device: str, extent: float, monkeypatch: pytes
     sampling = Sampling(sharpness=20.0, step=0.1, active_surface=3, active_radiance=2)
     found = []
     for dtype in (torch.float32, torch.float64):
-        modules = [m.to(device, dtype) for m in (surface, appearance, occupancy)]
+        for module in (surface, appearance, occupancy):
+            module.to(device, dtype)
         inputs = [x.to(dtype) for x in rays]
         leaves = [*surface.parameters(), appearance.table, *(x.requires_grad_() for x in inputs[:2])]
-        hits = trace_by_parts(*modules, *inputs, sampling)
+        hits = kernels.trace(*surface.at(3), appearance.at(2), occupancy.states, Rays(*inputs), sampling)
         loss = hits.features.square().sum() + (hits.opacity * torch.arange(24, device=device)).sum()
         found.append([x.detach() for x in (hits.features, hits.opacity, hits.depth, *torch.autograd.grad(loss, leaves))])
         assert hits.samples > 50
@@ -377,33 +383,37 @@ def test_many_samples_on_the_gpu() -> None:
 
 
 F32, I64, I32 = "*fp32", "*i64", "i32"
-GRID, SIZES = {"resolutions": I64, "offsets": I64}, {"FEATURES": 4, "BLOCK": cuda._BLOCK}
-RAYS = {"RAYS": cuda._RAYS, "SAMPLES": cuda._SAMPLES}
+GRID, SIZES = {"resolutions": I64, "offsets": I64}, {"FEATURES": 4, "BLOCK": encoding.BLOCK}
+RAYS = {"RAYS": sections._RAYS, "SAMPLES": sections._SAMPLES}
 LANES = {"lanes": I64, "sdf": F32, "origins": F32, "directions": F32, "fars": F32, "jitters": F32, "states": "*u8", "memory": F32}
-STEP = dict.fromkeys(["half", "extent", "step", "skip", "stride", "soft", "grazing", "opaque"], "fp32") | {"sharpness": "fp64"}
+STEP = dict.fromkeys(["half", "extent", "step", "skip", "sphere_step_factor", "soft", "min_slope", "max_optical_depth"], "fp32") | {
+    "sharpness": "fp64"
+}
 SIGNATURES: dict[str, tuple[dict[str, str], dict[str, float]]] = {
-    "_encode": (
+    "encoding.encode_kernel": (
         {"positions": F32, "table": F32, **GRID, "out": F32, "count": I32, "levels": I32, "active": I32},
-        SIZES | {"LEVELS": cuda._LEVELS},
+        SIZES | {"LEVELS": encoding._LEVELS},
     ),
-    "_encode_backward": (
+    "encoding.encode_backward_kernel": (
         {"positions": F32, "gradient": F32, "stride": I32, **GRID, "out": F32, "count": I32, "active": I32},
-        SIZES | {"LEVELS": cuda._LEVELS},
+        SIZES | {"LEVELS": encoding._LEVELS},
     ),
-    "_encode_backward_positions": (
+    "encoding.encode_positions_backward_kernel": (
         {"positions": F32, "table": F32, "gradient": F32, "stride": I32, **GRID, "out": F32, "count": I32, "active": I32},
         SIZES,
     ),
-    "_sections": ({"sdf": F32, "sharpness": "fp64", "offsets": I64, "weights": F32, "crossing": F32, "rays": I32}, RAYS),
-    "_sections_backward": ({"sdf": F32, "sharpness": "fp64", "offsets": I64, "gradient": F32, "out": F32, "rays": I32}, RAYS),
-    "_surface": (
+    "sections.sections_kernel": ({"sdf": F32, "sharpness": "fp64", "offsets": I64, "weights": F32, "crossing": F32, "rays": I32}, RAYS),
+    "sections.sections_backward_kernel": (
+        {"sdf": F32, "sharpness": "fp64", "offsets": I64, "gradient": F32, "out": F32, "rays": I32}, RAYS,
+    ),
+    "surface.surface_kernel": (
         {"positions": F32, "scale": "fp32", "inner": "fp32", "outer": "fp32", "table": F32, **GRID, "weight": F32, "last": F32, "out": F32,
          "count": I32, "active": I32},
         {"UNITS": 32, **SIZES, "HIDDEN": 32},
     ),
-    "_round": (
+    "marching.round_kernel": (
         {**LANES, "found": F32, "counts": I64, "where": F32, "alive": "*u8", "count": I32, "rays": I32, "k": I32, "grid": I32, **STEP},
-        {"MOST": reference.MOST, "ONWARD": reference._ONWARD, "CONTRACTED": 1, "LANES": cuda._LANES},
+        {"MAX_SAMPLES_PER_RAY": MAX_SAMPLES_PER_RAY, "LEAST_ADVANCE": LEAST_ADVANCE, "CONTRACTED": 1, "LANES": marching._LANES},
     ),
 }  # fmt: skip
 
@@ -419,12 +429,13 @@ def test_compiles_for_hopper(name: str, tmp_path: object, monkeypatch: pytest.Mo
     from triton.compiler import ASTSource
 
     arguments, constants = SIGNATURES[name]
-    kernel = getattr(cuda, name)
+    module, kernel = name.split(".")
+    kernel = getattr(importlib.import_module(f"{cuda.__name__}.{module}"), kernel)
     assert kernel.arg_names == [*arguments, *constants]
     signature = arguments | dict.fromkeys(constants, "constexpr")
     aligned = {(i,): [["tt.divisibility", 16]] for i, kind in enumerate(arguments.values()) if kind.startswith("*")}
     source = ASTSource(kernel, signature, {(kernel.arg_names.index(k),): v for k, v in constants.items()}, aligned)
     compiled = triton.compile(source, target=GPUTarget("cuda", 90, 32))
     assert compiled.asm["cubin"]
-    if name.startswith("_encode"):  # the features of a row in one access
+    if name.startswith("encoding"):  # the features of a row in one access
         assert "ld.global.v4.b32" in compiled.asm["ptx"] or "add.v4.f32" in compiled.asm["ptx"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize, softplus
 
+from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
-from mmsynth.field.radiance import Shader, intensity, radiance
+from mmsynth.field.kernels import intensity, radiance
+from mmsynth.field.radiance import Shader
+from mmsynth.field.storage import load_field, save_field
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.polarization import coherency_from_factor, coherency_to_stokes
@@ -36,7 +40,7 @@ def _field(background: bool, region: Region | None = None) -> Field:
     with torch.no_grad():
         field.surface.output_weight.normal_(0, 0.05)
         field.appearance.table.normal_()
-    field.sampling = replace(field.sampling, sharpness=400.0, step=0.005)
+    field.sampling = field.sampling._replace(sharpness=400.0, step=0.005)
     return field
 
 
@@ -56,7 +60,7 @@ def test_normals_are_those_of_the_surface_that_is_seen(background: bool) -> None
     points = (origins + directions * out["depth"][:, None])[hit].double().requires_grad_()
     field.double()
     place = kernels.contract(points) if background else points
-    value = field.surface.reference(place, field.sampling.active_surface)
+    value = kernels.reference.surface_value(place, *field.surface.at(field.sampling.active_surface))
     apart = value.detach().abs()  # the depth is where the surface is; where a ray grazes it, within the soft part
     assert float(apart.quantile(0.95)) < 0.1 * field.sampling.step and float(apart.max()) < 3.5 / field.sampling.sharpness
     (slope,) = torch.autograd.grad(value.sum(), points)
@@ -91,7 +95,7 @@ def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
     field = _field(True, Region((10.0, 0.0, -5.0), 3.0))
     x = np.array([[10.0, 0.0, -5.0], [10.0, 1.8, -5.0], [10.0, 0.0, 25.0], [-300.0, 200.0, 0.0]])
     unit = torch.from_numpy((x - [10.0, 0.0, -5.0]) / 3.0)
-    expected = 3.0 * field.double().surface.reference(kernels.contract(unit), 2)
+    expected = 3.0 * kernels.surface_value(kernels.contract(unit), *field.double().surface.at(2))
     np.testing.assert_allclose(field.float().sdf(x), expected.detach().numpy(), atol=1e-5)
     assert field.sdf(np.empty((0, 3))).shape == (0,)
 
@@ -160,8 +164,8 @@ def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> No
     field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
     field.occupancy.states[3, 4, 5] = 17
     field.sensors["nir"] = replace(NIR, saturation=float("inf"), mosaic=np.array([[0]]))
-    field.save(tmp_path)
-    again = Field.load(tmp_path)
+    save_field(field, tmp_path)
+    again = load_field(tmp_path)
     assert (again.design, again.region, again.sampling, again.radiance_scale) == (
         field.design,
         field.region,
@@ -172,6 +176,16 @@ def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> No
     assert int(again.occupancy.states[3, 4, 5]) == 17 and again.surface.grid.extent == field.surface.grid.extent
     a, b = _look_around(field, 50)[2], _look_around(again, 50)[2]
     assert all(torch.equal(a[name].nan_to_num(), b[name].nan_to_num()) for name in a)
+
+
+@pytest.mark.parametrize(("stated", "found"), [(None, "no format"), (1, "format 1"), (99, "format 99")])
+def test_a_run_of_another_version_is_refused(tmp_path: Path, stated: int | None, found: str) -> None:
+    save_field(_field(False), tmp_path)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    del manifest["format"]
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest | ({} if stated is None else {"format": stated})))
+    with pytest.raises(InputError, match=rf"manifest\.json: {found}, expected 2: .*another version of mmsynth; fit the scene again\.$"):
+        load_field(tmp_path)
 
 
 def test_modalities_have_their_own_outputs() -> None:

@@ -18,10 +18,12 @@ from torch.nn.functional import normalize
 
 from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
-from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, cpu
+from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, Sampling, cpu, reference
+from mmsynth.field.kernels.cpu import stores
+from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.occupancy import Occupancy
-from mmsynth.field.rendering import Sampling
 from mmsynth.field.surface import Surface
+from mmsynth.field.warmup import warm_up
 
 
 def assert_near(found: torch.Tensor, expected: torch.Tensor, tolerance: float, name: str) -> None:
@@ -75,7 +77,7 @@ def test_surface_value(grid: str, extent: float, active: int, count: int) -> Non
     exact = copy.deepcopy(surface).double()
     a = _positions(count, surface.grid).requires_grad_()
     b = a.detach().double().requires_grad_()
-    found, expected = surface(a, active), exact.reference(b, active)
+    found, expected = surface(a, active), reference.surface_value(b, *exact.at(active))
     assert found.shape == (count,)
     gradient = torch.randn(count, generator=torch.Generator().manual_seed(1))
     found.backward(gradient)
@@ -96,7 +98,7 @@ def test_more_active_levels_than_there_are_is_all() -> None:
     surface = _surface("dense", 1.0)
     x = _positions(200, surface.grid)
     assert torch.equal(surface(x, 40), surface(x, 2))
-    torch.testing.assert_close(surface(x, 40), surface.reference(x, 40), atol=1e-5, rtol=0)
+    torch.testing.assert_close(surface(x, 40), reference.surface_value(x, *surface.at(40)), atol=1e-5, rtol=0)
 
 
 def test_layouts_of_what_comes_in() -> None:
@@ -145,8 +147,8 @@ def test_values_are_the_same_without_a_gradient() -> None:
 def test_nothing_is_stored_where_no_gradient_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rendering 8192 rays would else keep 32 chunks, hundreds of megabytes."""
     slots = []
-    store = cpu._Store
-    monkeypatch.setattr(cpu, "_Store", lambda n, sizes: slots.append(n) or store(n, sizes))
+    store = stores.Store
+    monkeypatch.setattr(stores, "Store", lambda n, kind, sizes: slots.append(n) or store(n, kind, sizes))
     surface, appearance, occupancy = _parts(1.0, "open", 0)
     origins, directions, jitter = (x.detach() for x in _rays(600, 0))
     with torch.no_grad():
@@ -154,7 +156,7 @@ def test_nothing_is_stored_where_no_gradient_can_be_asked_for(monkeypatch: pytes
         rendering.trace(surface, appearance, occupancy, origins, directions, jitter, SAMPLINGS["soft"])
     assert slots == [numba.get_num_threads()] * 2
     rendering.trace(surface, appearance, occupancy, origins, directions, jitter, SAMPLINGS["soft"])
-    assert slots[2:] == [-(-600 // cpu.CHUNK)]
+    assert slots[2:] == [-(-600 // CHUNK)]
 
 
 def test_hidden_units_come_in_fours() -> None:
@@ -263,8 +265,8 @@ def _compare(parts: Parts, rays: Rays, sampling: Sampling) -> rendering.Hits:
 
 def test_float32_is_fused_and_float64_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     parts, rays = _parts(1.0, "own", 0), _rays(10, 0)
-    monkeypatch.setattr(rendering, "trace_by_parts", None)
-    monkeypatch.setattr(parts[0], "reference", None)
+    monkeypatch.setattr(reference, "trace", None)
+    monkeypatch.setattr(reference, "surface_value", None)
     _quantities(parts, *rays, SAMPLINGS["soft"])
     monkeypatch.undo()
     monkeypatch.setattr(cpu, "trace", None)
@@ -287,7 +289,7 @@ def test_trace(extent: float, states: str, sampling: str) -> None:
         assert int(hits.samples) > 60 * len(hits.opacity)
 
 
-@pytest.mark.parametrize("count", [1, cpu.CHUNK - 1, cpu.CHUNK, cpu.CHUNK + 1, 700])
+@pytest.mark.parametrize("count", [1, CHUNK - 1, CHUNK, CHUNK + 1, 700])
 def test_trace_of_parts_of_chunks(count: int) -> None:
     _compare(_parts(1.0, "own", 2), _rays(count, 5), SAMPLINGS["soft"])
 
@@ -374,7 +376,7 @@ def test_results_do_not_depend_on_the_number_of_threads(extent: float, threads: 
 
 def test_is_compiled_says_so() -> None:
     """In a process that has run nothing yet: the kernels of this one are in the cache on disk."""
-    kernels.announce_compilation()
+    warm_up()
     assert cpu.is_compiled()
     program = "from mmsynth.field.kernels import cpu; print(cpu.is_compiled())"
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout == "True\n"

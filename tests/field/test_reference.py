@@ -12,13 +12,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from torch.nn.functional import normalize, softplus
 
-from mmsynth.field.encoding import HashGrid, spherical_harmonics
-from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, reference
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, Rays, Sampling, reference
+from mmsynth.field.kernels.reference import spherical_harmonics
 from mmsynth.field.occupancy import Occupancy
-from mmsynth.field.radiance import Shader
-from mmsynth.field.rendering import Sampling, ball_interval
+from mmsynth.field.rendering import ball_interval
 from mmsynth.field.surface import Surface
-from mmsynth.scene.scene import Sensor
 
 # dense and hashed levels
 RESOLUTIONS, OFFSETS = torch.tensor([2, 3, 9, 40]), torch.tensor([0, 27, 91, 155, 171])
@@ -85,7 +84,7 @@ def test_harmonics_are_orthonormal_and_in_the_order_of_their_degrees() -> None:
     mixed = np.linalg.lstsq(y, spherical_harmonics(torch.from_numpy(d @ turn.T)).numpy(), rcond=None)[0]
     degree = np.repeat(np.arange(4), 2 * np.arange(4) + 1)
     assert np.abs(mixed[degree[:, None] != degree]).max() < 1e-12
-    assert Shader(4, 8, {"mono": Sensor("mono", ("mono",), (None,))}, {"mono": 1.0}).term_degree.tolist() == degree.tolist()
+    assert reference.HARMONIC_DEGREES.tolist() == degree.tolist()
 
 
 # --- surface
@@ -109,7 +108,7 @@ def test_surface_gradients(extent: float, active: int) -> None:
 def test_a_new_surface_is_a_sphere_within_a_sphere() -> None:
     surface = Surface(HashGrid(3, 8, 3, 11, 2.0), 8, (0.5, 1.9))
     x = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.4, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.95]])
-    for value in (surface(x, 3), surface.reference(x, 3)):
+    for value in (surface(x, 3), reference.surface_value(x, *surface.at(3))):
         torch.testing.assert_close(value, torch.tensor([-0.5, 0.0, 0.5, -0.05]), atol=1e-6, rtol=0)
 
 
@@ -238,7 +237,7 @@ def _march(sdf: Distance, extent: float, classified: bool, jitter: float) -> tup
         occupancy.update(sdf, SHARPNESS, torch.Generator().manual_seed(0), 1.0)
         assert (occupancy.states == SHELL).any() and (occupancy.states >= OUTSIDE).float().mean() > 0.3
     t, ray, offsets = reference.march(
-        sdf, origins, directions, near, far, torch.full((120,), jitter).double(), occupancy.states, extent, SAMPLING
+        sdf, Rays(origins, directions, near, far, torch.full((120,), jitter).double()), occupancy.states, extent, SAMPLING
     )
     assert torch.equal(ray, torch.repeat_interleave(torch.arange(120), offsets.diff())) and len(t) == offsets[-1]
     padded = torch.full((120, int(offsets.diff().max())), torch.nan, dtype=torch.float64)
@@ -303,7 +302,7 @@ def test_free_rays_end_with_few_samples_or_none() -> None:
     near, far, jitter = torch.zeros(4).double(), torch.full((4,), 1.8).double(), torch.zeros(4).double()
     free = torch.full((8, 8, 8), OUTSIDE, dtype=torch.uint8)
     for value in (OUTSIDE, OUTSIDE + 1, 253):
-        t, ray, offsets = reference.march(sphere, *rays, near, far, jitter, free.fill_(value), 1.0, SAMPLING)
+        t, ray, offsets = reference.march(sphere, Rays(*rays, near, far, jitter), free.fill_(value), 1.0, SAMPLING)
         assert len(t) == len(ray) == 0 and offsets.tolist() == [0] * 5
 
 
@@ -314,20 +313,20 @@ def test_certified_distance_is_gone_at_once() -> None:
     ray = torch.tensor([[-0.9, 0.1, 0.1]]).double(), torch.tensor([[1.0, 0.0, 0.0]]).double()
     rest = torch.zeros(1).double(), torch.full((1,), 1.8).double(), torch.zeros(1).double()
     away = lambda x: torch.full_like(x[:, 0], 0.2)
-    t, _, _ = reference.march(away, *ray, *rest, states, 1.0, SAMPLING)
+    t, _, _ = reference.march(away, Rays(*ray, *rest), states, 1.0, SAMPLING)
     assert len(t) and t[0] == pytest.approx(0.4, abs=0.2 * STEP)
     states[0] = OUTSIDE + 8  # half cells: up to x = 0.1
-    assert len(reference.march(away, *ray, *rest, states, 1.0, SAMPLING)[0]) == 0
+    assert len(reference.march(away, Rays(*ray, *rest), states, 1.0, SAMPLING)[0]) == 0
 
 
 def test_a_ray_ends_at_its_second_sample_in_a_solid_cell() -> None:
     states = torch.full((8, 8, 8), SOLID, dtype=torch.uint8)
     ray = torch.tensor([[-0.9, 0.1, 0.1]]).double(), torch.tensor([[1.0, 0.0, 0.0]]).double()
     rest = torch.zeros(1).double(), torch.full((1,), 1.8).double(), torch.zeros(1).double()
-    t, _, _ = reference.march(lambda x: torch.full_like(x[:, 0], 0.2), *ray, *rest, states, 1.0, SAMPLING)
+    t, _, _ = reference.march(lambda x: torch.full_like(x[:, 0], 0.2), Rays(*ray, *rest), states, 1.0, SAMPLING)
     assert len(t) == 2
     states[:4] = SHELL  # the first solid cell begins at x = 0
-    t, _, _ = reference.march(lambda x: torch.full_like(x[:, 0], 0.0), *ray, *rest, states, 1.0, SAMPLING)
+    t, _, _ = reference.march(lambda x: torch.full_like(x[:, 0], 0.0), Rays(*ray, *rest), states, 1.0, SAMPLING)
     assert 0.9 <= t[-1] <= 0.9 + STEP / SAMPLING.min_slope and (t[:-1] < 0.9).all()
 
 
@@ -335,8 +334,8 @@ def test_no_ray_takes_more_than_the_most_samples() -> None:
     ray = torch.tensor([[-0.9, 0.1, 0.1]]).double(), torch.tensor([[1.0, 0.0, 0.0]]).double()
     rest = torch.zeros(1).double(), torch.full((1,), 1.8).double(), torch.zeros(1).double()
     small = Sampling(SHARPNESS, 1e-3, 1, 1)
-    t, _, _ = reference.march(lambda x: 0 * x[:, 0], *ray, *rest, torch.zeros(8, 8, 8, dtype=torch.uint8), 1.0, small)
-    assert len(t) == reference.MOST
+    t, _, _ = reference.march(lambda x: 0 * x[:, 0], Rays(*ray, *rest), torch.zeros(8, 8, 8, dtype=torch.uint8), 1.0, small)
+    assert len(t) == reference.MAX_SAMPLES_PER_RAY
     # a distance that does not fall is stepped over with the least slope
     torch.testing.assert_close(t.diff()[1:], torch.full((94,), 2e-3).double())
 

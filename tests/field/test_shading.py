@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mmsynth.field.kernels import cpu
+from mmsynth.field.kernels import cpu, reference
 from mmsynth.field.kernels.cpu import shading as cpu_shading
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting import losses
@@ -48,7 +48,7 @@ class Case:
     opacity: torch.Tensor
     batch: Batch
     degrees: torch.Tensor
-    teaches: torch.Tensor
+    trains_geometry: torch.Tensor
     gain: torch.Tensor | None
 
     def double(self) -> Case:
@@ -115,7 +115,7 @@ def _quantities(case: Case) -> dict[str, torch.Tensor]:
 
 
 def _compare(case: Case) -> tuple[torch.Tensor, torch.Tensor]:
-    return losses.compare(case.shader, case.features, case.opacity, case.batch, case.degrees, case.teaches, case.gain)
+    return losses.compare(case.shader, case.features, case.opacity, case.batch, case.degrees, case.trains_geometry, case.gain)
 
 
 def _check(case: Case) -> dict[str, torch.Tensor]:
@@ -141,7 +141,7 @@ def test_compare(count: int) -> None:
         assert 0.1 < clipped.float().mean() < 0.5 and (found["squared"][clipped] == 0).any()
         assert (found["squared"].sqrt() > 0.5 * case.batch.level).any()  # the linear part of the loss, too
         for name in ("features", "opacity"):
-            assert not found[f"gradient of {name}"][~case.teaches].any() and found[f"gradient of {name}"].any()
+            assert not found[f"gradient of {name}"][~case.trains_geometry].any() and found[f"gradient of {name}"].any()
 
 
 @pytest.mark.parametrize("modalities", [(FILM,), (TENSOR,), (MOSAIC, FILM), (ANALYSERS, TENSOR)])
@@ -164,7 +164,7 @@ def test_compare_with_one_degree(degree: int) -> None:
 
 def test_float32_is_fused_and_float64_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     case = _case(10)
-    monkeypatch.setattr(losses, "compare_by_parts", None)
+    monkeypatch.setattr(reference, "compare", None)
     _quantities(case)
     monkeypatch.undo()
     monkeypatch.setattr(cpu, "compare", None)
@@ -173,7 +173,7 @@ def test_float32_is_fused_and_float64_is_not(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_scarce_rays_teach_the_heads_alone() -> None:
     case = _case(50)
-    case.teaches[:] = False
+    case.trains_geometry[:] = False
     found = _check(case)
     taught = {name for name, value in found.items() if value.any()}
     assert taught == {"loss", "squared", "gradient of gain", "gradient of heads.weight", "gradient of heads.bias"}

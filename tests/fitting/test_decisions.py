@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting import losses
 from mmsynth.fitting.decisions import DEGREES, Residuals, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
@@ -58,7 +58,9 @@ def test_the_degree_that_light_has_is_found(needed: int) -> None:
     teacher = torch.optim.Adam(shader.parameters(), lr=8e-3)
     for _ in range(150):
         teacher.zero_grad()
-        losses.photometric(losses.predict(shader(torch.zeros(rays, 2), directions, DEGREES), ones, batch) - light, batch).backward()
+        kernels.photometric(
+            kernels.predict(shader(torch.zeros(rays, 2), directions, DEGREES), ones, batch.measured) - light, batch.measured
+        ).backward()
         teacher.step()
     before = [p.detach().clone() for p in shader.parameters()]
     errors = errors_by_degree(shader, torch.zeros(rays, 2), ones, batch)["grey"]

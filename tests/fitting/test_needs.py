@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field, save_field
 from mmsynth.fitting.measurements import load_measurements
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.recipe import Recipe
@@ -111,9 +111,9 @@ def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) 
     assert _past_the_ball(trainer, scene) < 0.5 * _past_the_ball(without, scene)
     # and it is still known after it was stored
     trainer.field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
-    trainer.field.save(tmp_path)
+    save_field(trainer.field, tmp_path)
     frame = scene.frames_of("rgb", scene.split.test)[0]
-    before, after = (f.render(frame.camera, frame.camera_to_world).channels["rgb"] for f in (trainer.field, Field.load(tmp_path)))
+    before, after = (f.render(frame.camera, frame.camera_to_world).channels["rgb"] for f in (trainer.field, load_field(tmp_path)))
     np.testing.assert_array_equal(before, after)
 
 

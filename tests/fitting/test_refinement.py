@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.recipe import Recipe
@@ -100,7 +101,7 @@ def test_poses_that_are_off_are_found_and_mended(scene: Scene, tmp_path: Path, v
     assert set(stored["views"]) == ({str(v) for v in scene.split.train} if views else set())
     assert set(stored["sensors"]) == (set(list(scene.sensors)[1:]) if sensors else set())
     # what was found is what operations see, also after the run was read again
-    again = Field.load(tmp_path)
+    again = load_field(tmp_path)
     for frame in off.frames:
         assert np.array_equal(again.pose_of(frame), field.pose_of(frame))
     for at in views_of_frames(again, off, "mono"):

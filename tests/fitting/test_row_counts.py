@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Design, Field
+from mmsynth.field.storage import load_field
 from mmsynth.fitting import run as run_module
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -169,5 +170,5 @@ def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
     assert resumed.design == whole.design and resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
     for name, value in whole.state_dict().items():
         assert torch.equal(resumed.state_dict()[name], value), name
-    loaded = Field.load(tmp_path / "cut")
+    loaded = load_field(tmp_path / "cut")
     assert loaded.design == whole.design and torch.equal(loaded.surface.grid.table, whole.surface.grid.table)

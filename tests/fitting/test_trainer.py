@@ -18,6 +18,7 @@ from conftest import ring
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
+from mmsynth.field.storage import load_field
 from mmsynth.field.surface import Surface
 from mmsynth.fitting import losses
 from mmsynth.fitting import run as run_module
@@ -99,7 +100,7 @@ def test_a_fit_learns_and_its_run_gives_the_same_field_back(scene: Scene, tmp_pa
     for name, scores in evaluate(field, scene)["modalities"].items():
         raw = np.concatenate([load_frame(field.sensors[name], f)[0].ravel() for f in scene.frames_of(name, scene.split.test)])
         assert scores["psnr"] > -10 * np.log10(raw.var()) + 2, name  # 2 dB above the best flat picture
-    again = Field.load(tmp_path / "run")
+    again = load_field(tmp_path / "run")
     frame = scene.frames_of("rgb", scene.split.test)[0]
     a, b = (f.render(frame.camera, frame.camera_to_world, ["rgb", "pol"]) for f in (field, again))
     np.testing.assert_array_equal(a.channels["rgb"], b.channels["rgb"])

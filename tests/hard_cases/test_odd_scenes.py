@@ -15,6 +15,7 @@ from small_scenes import FOCAL, HEIGHT, QUICK, RADIUS, WIDTH, around, look_from,
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
+from mmsynth.field.storage import load_field
 from mmsynth.fitting import motions
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -211,7 +212,7 @@ def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [(32, 1), (1, 24), (1, 1)])
 def test_pictures_of_one_row_or_column_or_pixel(row: Row, tmp_path: Path, size: tuple[int, int]) -> None:
     _fit(tmp_path, {"rgb": around(6)}, size=size)
-    evaluate(Field.load(tmp_path / "run"), load_scene(tmp_path / "scene"))
+    evaluate(load_field(tmp_path / "run"), load_scene(tmp_path / "scene"))
     seen = picture(around(6)[0], 1.0, *size)
     with pytest.raises(ValueError, match="win_size exceeds image extent"):
         structural_similarity(seen, seen, data_range=1.0, channel_axis=-1)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mmsynth.field.radiance import intensity
-from mmsynth.fitting import losses
+from mmsynth.field import kernels
+from mmsynth.field.kernels import intensity
 from mmsynth.fitting.measurements import Batch
 from mmsynth.sensors.mosaic import channel_map, demosaic, mosaic
 from mmsynth.sensors.polarization import (
@@ -214,7 +214,9 @@ def test_saturated_photosites_say_at_least(row: Row) -> None:
     optimiser = torch.optim.Adam([raw], 0.02)
     for _ in range(1500):
         optimiser.zero_grad()
-        losses.photometric(losses.residual(losses.predict(raw, torch.ones(1), batch), batch), batch).backward()
+        kernels.photometric(
+            kernels.residual(kernels.predict(raw, torch.ones(1), batch.measured), batch.measured), batch.measured
+        ).backward()
         optimiser.step()
     factor = coherency_from_factor(raw.detach())[0]
     ours = coherency_to_stokes(factor @ factor.mT, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, -1.0, 0.0]))
@@ -233,7 +235,7 @@ def test_black_photosites_pull_no_harder_than_others(row: Row) -> None:
     batch = _batch([0.0] * 4, 1.0)
     raw = torch.zeros(1, 6, requires_grad=True)
     for _ in range(300):
-        loss = losses.photometric(losses.residual(losses.predict(raw, torch.ones(1), batch), batch), batch)
+        loss = kernels.photometric(kernels.residual(kernels.predict(raw, torch.ones(1), batch.measured), batch.measured), batch.measured)
         (gradient,) = torch.autograd.grad(loss, raw)
         assert torch.isfinite(gradient).all()
         raw = (raw - 0.5 * gradient).detach().requires_grad_()

@@ -14,10 +14,11 @@ from usual import nerfacc_keeps, neus_weights
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Design, Field
-from mmsynth.field.kernels import OUTSIDE, SHELL, reference
-from mmsynth.field.kernels.cpu import rays as cpu_rays
+from mmsynth.field.kernels import OUTSIDE, SHELL, Hits, Rays, Sampling, reference
+from mmsynth.field.kernels.constants import MAX_SAMPLES_PER_RAY
+from mmsynth.field.kernels.cpu import marching
 from mmsynth.field.occupancy import Occupancy
-from mmsynth.field.rendering import Hits, Sampling, ball_interval, trace, trace_by_parts
+from mmsynth.field.rendering import ball_interval, trace
 from mmsynth.field.surface import Surface
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
@@ -59,10 +60,10 @@ def _trace(
         interval = ball_interval(origins.detach(), directions.detach())
         if surface.grid.extent > 1:
             interval = torch.zeros_like(shift), torch.full_like(shift, 1e3)
-    near, far = (x.to(origins) for x in interval)
-    if way == "fused":
-        return Hits(*kernels.cpu.trace(surface, appearance, occupancy.states, origins, directions, near, far, shift, sampling))
-    return trace_by_parts(surface, appearance, occupancy, origins, directions, near, far, shift, sampling)
+    rays = Rays(origins, directions, *(x.to(origins) for x in interval), shift)
+    operations = kernels.cpu if way == "fused" else reference
+    look = appearance.at(sampling.active_radiance)
+    return operations.trace(*surface.at(sampling.active_surface), look, occupancy.states, rays, sampling)
 
 
 def _towards(count: int, miss: float, distance: float = 3.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -385,7 +386,7 @@ def test_steps_smaller_than_float32_resolves_so_far_away_come_to_an_end(way: str
     hits = _trace(way, parts, *_towards(200, 0.8, distance), Sampling(2 / step, step, 2, 2))
     assert not hits.opacity.any()
     hits = _trace(way, parts, *_towards(200, 0.1, distance), Sampling(2 / step, step, 2, 2))
-    assert torch.isfinite(hits.opacity).all() and hits.samples <= 200 * reference.MOST
+    assert torch.isfinite(hits.opacity).all() and hits.samples <= 200 * MAX_SAMPLES_PER_RAY
     if step == 1e-3:
         exact = torch.full((200,), distance - np.sqrt(0.24))
         torch.testing.assert_close(hits.depth, exact, rtol=2.5e-7, atol=2e-3)
@@ -403,26 +404,26 @@ def test_a_grazing_ray(way: str) -> None:
         assert torch.isfinite(origins.grad).all()
         found = hits.opacity.detach()
         tau = softplus(torch.tensor(-400 * (miss - 0.5)).double())
-        exact = 1.0 if tau > SAMPLING.opaque else float(1 - torch.exp(-tau))
+        exact = 1.0 if tau > SAMPLING.max_optical_depth else float(1 - torch.exp(-tau))
         torch.testing.assert_close(found, torch.full_like(found, exact), atol=0.03, rtol=0)
         opacity.append(float(found.mean()))
     assert opacity == sorted(opacity, reverse=True) and opacity[0] > 0.999 and opacity[-1] < 1e-6
 
 
-class _Sheet:
+def _sheet(half: float) -> Callable[[torch.Tensor], torch.Tensor]:
     """|z| - half: a sheet of which the distance is true."""
+    return lambda x: x[:, 2].abs() - half
 
-    def __init__(self, half: float) -> None:
-        self.half, self.grid = half, HashGrid(1, 8, 4, 4)
 
-    def __call__(self, x: torch.Tensor, active: int) -> torch.Tensor:
-        return x[:, 2].abs() - self.half
+def _trace_sheet(half: float, occupancy: Occupancy, rays: Rays) -> Hits:
+    samples = reference.march(_sheet(half), rays, occupancy.states, 1.0, SAMPLING)
+    return reference.composite(_sheet(half), HashGrid(1, 8, 4, 4).double().at(2), rays, samples, SAMPLING)
 
 
 def _bounds(half: float) -> tuple[float, float]:
     """Opacity of a sheet or ball of half a thickness: a sample is within half a step of the middle."""
     worst, exact = (float(softplus(torch.tensor(-SAMPLING.sharpness * f))) for f in (SAMPLING.step / 2 - half, -half))
-    upper = 1.0 if exact > SAMPLING.opaque else 1 - np.exp(-exact)
+    upper = 1.0 if exact > SAMPLING.max_optical_depth else 1 - np.exp(-exact)
     return 1 - np.exp(-worst), upper
 
 
@@ -434,11 +435,11 @@ def test_a_thin_sheet_is_not_stepped_over(row: Row, steps: float) -> None:
     jitter = torch.linspace(0, 0.99, 180).double()
     near, far = torch.full((180,), 0.0).double(), torch.full((180,), 1.8).double()
     occupancy = Occupancy(16)
-    hits = trace_by_parts(_Sheet(half), HashGrid(1, 8, 4, 4).double(), occupancy, -0.9 * tilted, tilted, near, far, jitter, SAMPLING)
+    hits = _trace_sheet(half, occupancy, Rays(-0.9 * tilted, tilted, near, far, jitter))
     low, high = _bounds(half)
     assert float(hits.opacity.min()) >= low - 1e-6 and float(hits.opacity.max()) <= high + 1e-6
-    occupancy.update(lambda x: _Sheet(half)(x, 1), SAMPLING.sharpness, torch.Generator().manual_seed(0), 1.0)
-    fewer = trace_by_parts(_Sheet(half), HashGrid(1, 8, 4, 4).double(), occupancy, -0.9 * tilted, tilted, near, far, jitter, SAMPLING)
+    occupancy.update(_sheet(half), SAMPLING.sharpness, torch.Generator().manual_seed(0), 1.0)
+    fewer = _trace_sheet(half, occupancy, Rays(-0.9 * tilted, tilted, near, far, jitter))
     assert fewer.samples < hits.samples and float(fewer.opacity.min()) >= low - 1e-6
     at = -0.9 * tilted[:, 2:] + tilted[:, 2:] * (torch.arange(64) + jitter[:, None]) / 64 * 1.8
     usual = float((at.abs() - half < 0).any(1).double().mean())
@@ -607,7 +608,7 @@ def test_places_on_the_border_of_the_cube_are_in_the_last_cell() -> None:
     inside = corners * (1 - 1e-5)
     torch.testing.assert_close(grid(corners, 2), grid(inside, 2), atol=1e-3, rtol=0)
     torch.testing.assert_close(surface(corners, 2), surface(inside, 2), atol=1e-3, rtol=0)
-    torch.testing.assert_close(surface(corners, 2), surface.reference(corners, 2), atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(surface(corners, 2), reference.surface_value(corners, *surface.at(2)), atol=1e-6, rtol=1e-6)
 
 
 def test_trace_chooses_the_interval_that_the_grid_has() -> None:
@@ -617,4 +618,4 @@ def test_trace_chooses_the_interval_that_the_grid_has() -> None:
     assert torch.equal(found.opacity, expected.opacity) and torch.equal(found.depth, expected.depth)
     beyond = trace(*_parts(extent=2.0), origins, -directions, torch.full((20,), 0.5), SAMPLING)
     assert (beyond.depth > 5).all() and (beyond.opacity > 0.99).all()  # the horizon, behind the camera
-    assert reference.MOST == cpu_rays.MOST
+    assert reference.MAX_SAMPLES_PER_RAY == marching.MAX_SAMPLES_PER_RAY

@@ -13,9 +13,8 @@ from small_scenes import QUICK, RADIUS, around, picture, write_scene
 from usual import nerfacc_keeps, neus_weights
 
 from mmsynth.errors import DivergedError
-from mmsynth.field.kernels import OUTSIDE, SHELL
-from mmsynth.field.rendering import ball_interval, trace_by_parts
-from mmsynth.fitting import losses
+from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, reference
+from mmsynth.field.rendering import ball_interval
 from mmsynth.fitting import run as run_module
 from mmsynth.fitting.measurements import draw
 from mmsynth.fitting.recipe import Recipe
@@ -47,8 +46,10 @@ def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
     o, d, zero = batch.origins, batch.directions, torch.zeros(128)
     sampling, optimiser, lost = sampling_at(0.0, trainer.recipe, trainer.needs), torch.optim.Adam(field.parameters(), 1e-3), []
     for _ in range(2):
-        hits = trace_by_parts(field.surface, field.appearance, field.occupancy, o, d, *ball_interval(o, d), zero, sampling)
-        loss, squared = losses.compare_by_parts(field.shader, hits.features, hits.opacity, batch, zero.long(), zero == 0)
+        tables = *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance)
+        hits = reference.trace(*tables, field.occupancy.states, Rays(o, d, *ball_interval(o, d), zero), sampling)
+        shaded = ShadedRays(hits.features, hits.opacity, d, zero.long(), zero == 0)
+        loss, squared = reference.compare(field.shader.weights(), shaded, batch.measured)
         lost.append(float(squared.isnan().float().mean()))
         loss.backward()
         optimiser.step()

@@ -1,4 +1,4 @@
-"""The operations in plain torch: the definition that the fast backends are tested against, on any device and dtype.
+"""The operations in plain torch: the definition that the fast back ends are tested against, on any device and in any precision.
 
 Symbols: N samples, R rays, L levels, T rows of all levels, F features per level. Samples are packed ray after ray;
 ``offsets`` (R + 1,) int64 delimits them. Section i runs from sample i to sample i + 1 of the same ray.
@@ -7,20 +7,41 @@ Symbols: N samples, R rays, L levels, T rows of all levels, F features per level
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
+from torch.nn.functional import huber_loss, linear, softplus
 
-if TYPE_CHECKING:
-    from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels.constants import (
+    ALONG_FACE,
+    FACE_OVERSHOOT,
+    HASH_PRIMES,
+    HUBER_DELTA,
+    LEAST_ADVANCE,
+    LEAST_WEIGHT,
+    LONGEST_STEP,
+    MAX_SAMPLES_PER_RAY,
+    NO_CROSSING,
+    OUTSIDE,
+    SOFT_SURFACE,
+    SOLID,
+)
+from mmsynth.field.kernels.parameters import (
+    GridTable,
+    Hits,
+    Measured,
+    Rays,
+    Samples,
+    Sampling,
+    ShadedRays,
+    ShaderWeights,
+    SurfaceNetwork,
+)
+from mmsynth.sensors.polarization import coherency_from_factor
 
-MOST = 96  # samples of one ray
-_SKIP = 0.25  # of the distance from the centre: the longest step in contracted space
-_ONWARD = 1.0 + 2.0**-22  # the least that a float32 moves on: a short step far from a ray's origin may round to none
-PRIMES = (1, 2654435761, 805459861)
-SHELL, SOLID, OUTSIDE = 0, 1, 2  # and more than OUTSIDE: half cells that are certainly free around the cell
+Encoding = Callable[[Tensor, Tensor, Tensor, Tensor, int], Tensor]  # see ``hash_encode``
+Weighing = Callable[[Tensor, float, Tensor], tuple[Tensor, Tensor]]  # see ``section_weights``
+HARMONIC_DEGREES = torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7)
 
 
 def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
@@ -47,11 +68,26 @@ def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: 
         if (resolution + 1) ** 3 <= len(rows):
             index = (cell[..., 0] * (resolution + 1) + cell[..., 1]) * (resolution + 1) + cell[..., 2]
         else:
-            index = (cell[..., 0] * PRIMES[0]) ^ (cell[..., 1] * PRIMES[1]) ^ (cell[..., 2] * PRIMES[2])
+            index = (cell[..., 0] * HASH_PRIMES[0]) ^ (cell[..., 1] * HASH_PRIMES[1]) ^ (cell[..., 2] * HASH_PRIMES[2])
             index = index & (len(rows) - 1)
         weight = torch.where(corners.bool(), fraction, 1 - fraction).prod(-1)
         out[:, level] = (rows[index] * weight[..., None]).sum(1)
     return out.reshape(positions.shape[0], levels * features)
+
+
+def encode(positions: Tensor, grid: GridTable, hash_encode: Encoding = hash_encode) -> Tensor:
+    """Features of positions in the frame of a grid, (N, 3) → (N, L F); those outside go to its border."""
+    unit = (positions * (0.5 / grid.extent) + 0.5).clamp(0.0, 1.0)
+    return hash_encode(unit, grid.table, grid.resolutions, grid.offsets, grid.active)
+
+
+def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork, hash_encode: Encoding = hash_encode) -> Tensor:
+    """Signed distance, positive outside: (N, 3) in the frame of the grid → (N,). min(|x| - r₀, r₁ - |x|) + network(features, x)."""
+    ones = torch.ones_like(positions[:, :1])
+    hidden = torch.relu(torch.cat([positions, ones, encode(positions, grid, hash_encode)], -1) @ network.hidden.T)
+    norm = torch.linalg.vector_norm(positions, dim=-1)
+    spheres = torch.minimum(norm - network.inner_radius, network.outer_radius - norm)
+    return hidden @ network.output[:-1] + network.output[-1] + spheres
 
 
 def contract(positions: Tensor) -> Tensor:
@@ -90,12 +126,12 @@ def _advance(
         if not bool(skip.any()):
             break
         face = (cell + (velocity > 0)) / half - extent
-        leave = torch.where(velocity.abs() > 1e-9, (face - where) / velocity, torch.full_like(where, 1e9)).amin(-1)
+        leave = torch.where(velocity.abs() > ALONG_FACE, (face - where) / velocity, torch.full_like(where, NO_CROSSING)).amin(-1)
         # the cell's certificate may reach beyond it
-        leave = torch.maximum(leave.clamp(min=0.0), (state.to(t) - OUTSIDE) / (2.0 * half * speed)) + 0.1 * step / speed
+        leave = torch.maximum(leave.clamp(min=0.0), (state.to(t) - OUTSIDE) / (2.0 * half * speed)) + FACE_OVERSHOOT * step / speed
         if extent > 1:
-            leave = torch.minimum(leave, _SKIP * reach)
-        t = torch.where(skip, torch.maximum(t + leave, t * _ONWARD), t)
+            leave = torch.minimum(leave, LONGEST_STEP * reach)
+        t = torch.where(skip, torch.maximum(t + leave, t * LEAST_ADVANCE), t)
         skipped |= skip
     # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
     entered = skipped & (t < far)
@@ -105,33 +141,22 @@ def _advance(
 
 
 def march(
-    sdf: Callable[[Tensor], Tensor],
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    jitter: Tensor,
-    states: Tensor,
-    extent: float,
-    sampling: Sampling,
-    most: int = MOST,
-) -> tuple[Tensor, Tensor, Tensor]:
+    sdf: Callable[[Tensor], Tensor], rays: Rays, states: Tensor, extent: float, sampling: Sampling, most: int = MAX_SAMPLES_PER_RAY
+) -> Samples:
     """Sample rays where the three-state grid says that a surface may be, guided by the distance at the samples.
 
     Outside cells are skipped, by the distance that they certify. From a sample with distance f, a ray goes on by
-    step / slope, the slope being how fast f fell since the last sample, or by ``stride`` (f - 3 / s) where that is longer. It
-    ends in a solid cell (at its second sample at the earliest), at an optical depth of ``opaque``, and after ``most`` samples.
+    step / slope, the slope being how fast f fell since the last sample, or by ``sphere_step_factor`` (f - 3 / s) where that is longer. It
+    ends in a solid cell (at its second sample at the earliest), at an optical depth of ``max_optical_depth``, and after ``most`` samples.
 
     Args:
-        sdf: (N, 3) → (N,). origins, directions: (R, 3). near, far, jitter: (R,).
-        states: (G, G, G) uint8 over [-extent, extent]³; space is contracted when extent > 1.
-    Returns:
-        t (N,), ray (N,) int64, offsets (R + 1,) int64.
+        sdf: (N, 3) → (N,). states: (G, G, G) uint8 over [-extent, extent]³; space is contracted when extent > 1.
     """
-    rays = len(origins)
+    origins, directions, near, far, jitter = rays
+    count = len(origins)
     s = sampling
     t = near + jitter * s.step
-    going = torch.arange(rays, device=t.device)
+    going = torch.arange(count, device=t.device)
     last = torch.zeros_like(t), torch.zeros_like(t)  # the last sample: where, distance
     depth = torch.zeros_like(t)
     found: list[tuple[Tensor, Tensor]] = []
@@ -151,20 +176,20 @@ def march(
             slope = (last[1][here] - f) / ((at - last[0][here]) * speed)
         last[0][here], last[1][here] = at, f
         jump = s.step / slope.clamp(min=s.min_slope)
-        jump = torch.where(f > 0, torch.maximum(jump, s.sphere_step_factor * (f - 3.0 / s.sharpness)), jump) / speed
+        jump = torch.where(f > 0, torch.maximum(jump, s.sphere_step_factor * (f - SOFT_SURFACE / s.sharpness)), jump) / speed
         if extent > 1:
-            jump = torch.minimum(jump, _SKIP * reach)
+            jump = torch.minimum(jump, LONGEST_STEP * reach)
         t[here] = at + jump
         going = here[(depth[here] <= s.max_optical_depth) & ~((state == SOLID) & (k > 0))]
         if not len(going):
             break
     if not found:
-        return t[:0], going[:0], torch.zeros(rays + 1, dtype=torch.int64, device=t.device)
+        return Samples(t[:0], going[:0], torch.zeros(count + 1, dtype=torch.int64, device=t.device))
     ray, at = torch.cat([r for r, _ in found]), torch.cat([x for _, x in found])
     order = torch.argsort(ray, stable=True)
-    offsets = torch.zeros(rays + 1, dtype=torch.int64, device=t.device)
-    offsets[1:] = torch.bincount(ray, minlength=rays).cumsum(0)
-    return at[order], ray[order], offsets
+    offsets = torch.zeros(count + 1, dtype=torch.int64, device=t.device)
+    offsets[1:] = torch.bincount(ray, minlength=count).cumsum(0)
+    return Samples(at[order], ray[order], offsets)
 
 
 def exclusive_sum(values: Tensor, offsets: Tensor, ray: Tensor) -> Tensor:
@@ -205,6 +230,145 @@ def section_weights(sdf: Tensor, sharpness: float, offsets: Tensor) -> tuple[Ten
         crosses = (sdf > 0) & (following <= 0) & ~last
         crossing = torch.where(crosses, sdf / torch.where(crosses, sdf - following, torch.ones_like(sdf)), torch.full_like(sdf, 0.5))
     return weights, crossing
+
+
+def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
+    """March, evaluate, weigh and composite the features of rays.
+
+    Args:
+        appearance: of the same extent as ``grid``. states: see ``march``. Gradients reach origins and directions of the rays with the
+            samples' distances held fixed.
+    """
+    sdf = lambda x: surface_value(x, grid, network)
+    with torch.no_grad():
+        samples = march(sdf, rays, states, grid.extent, sampling)
+    return composite(sdf, appearance, rays, samples, sampling)
+
+
+def composite(
+    sdf: Callable[[Tensor], Tensor], appearance: GridTable, rays: Rays, samples: Samples, sampling: Sampling,
+    hash_encode: Encoding = hash_encode, section_weights: Weighing = section_weights,
+) -> Hits:  # fmt: skip
+    """Evaluate, weigh and composite the samples of R rays.
+
+    Appearance is looked up where each section crosses the surface, once per section that matters; it is shaded once per ray.
+    """
+    t, ray, offsets = samples
+    count = len(rays.origins)
+
+    def position(ray: Tensor, t: Tensor) -> Tensor:
+        points = rays.origins[ray] + rays.directions[ray] * t[:, None]
+        return contract(points) if appearance.extent > 1.0 else points
+
+    weights, crossing = section_weights(sdf(position(ray, t)), sampling.sharpness, offsets)
+    with torch.no_grad():
+        # what is left of a ray that was ended goes to its last section
+        before = exclusive_sum(weights, offsets, ray)
+        enough = -torch.expm1(torch.tensor(-sampling.max_optical_depth))
+        ends = (before + weights > enough) & ~(before > enough)
+        rest = torch.where(ends, 1.0 - before - weights, torch.zeros_like(weights))
+    weights = weights + rest
+    opacity = weights.new_zeros(count).index_add(0, ray, weights)
+    chosen = torch.nonzero(weights.detach() > sampling.min_section_weight)[:, 0]
+    following = (chosen + 1).clamp(max=max(len(t) - 1, 0))
+    at, w = ray[chosen], weights[chosen]
+    encoded = encode(position(at, torch.lerp(t[chosen], t[following], crossing[chosen])), appearance, hash_encode)
+    shown = w.new_zeros(count).index_add(0, at, w)
+    features = torch.zeros(count, encoded.shape[1], dtype=w.dtype, device=w.device).index_add(0, at, w[:, None] * encoded)
+    depth = _median_depth(t, weights.detach(), before, crossing, ray, count)
+    return Hits(features / shown.clamp(min=LEAST_WEIGHT)[:, None], opacity, depth, torch.tensor(len(t)))
+
+
+def _median_depth(t: Tensor, weights: Tensor, before: Tensor, crossing: Tensor, ray: Tensor, rays: int) -> Tensor:
+    """Ray distance at which half of the light is met, at the surface crossing of that section: (R,), NaN = no hit.
+
+    Args:
+        t, weights, before, crossing, ray: (N,) of packed samples; ``before`` is the weight in front of each section.
+    """
+    depth = torch.full((rays,), float("nan"), dtype=t.dtype, device=t.device)
+    reached = torch.nonzero((before + weights >= 0.5) & (before < 0.5))[:, 0]
+    following = (reached + 1).clamp(max=max(len(t) - 1, 0))
+    return depth.index_put((ray[reached],), torch.lerp(t[reached], t[following], crossing[reached]))
+
+
+def spherical_harmonics(d: Tensor) -> Tensor:
+    """Real spherical harmonics up to degree 3 (orthonormal), (N, 3) unit vectors → (N, 16)."""
+    x, y, z = d.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack([
+        torch.full_like(x, 0.28209479177387814),
+        0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x,
+        1.0925484305920792 * x * y, 1.0925484305920792 * y * z, 0.31539156525252005 * (3 * zz - 1),
+        1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
+        0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z, 0.4570457994644658 * y * (5 * zz - 1),
+        0.3731763325901154 * z * (5 * zz - 3), 0.4570457994644658 * x * (5 * zz - 1), 1.445305721320277 * z * (xx - yy),
+        0.5900435899266435 * x * (xx - 3 * yy),
+    ], -1)  # fmt: skip
+
+
+def hidden_layers(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees: Tensor | int) -> Tensor:
+    """The last hidden layer of the shader, (R, H), which all modalities share."""
+    seen = HARMONIC_DEGREES.to(features.device) <= (degrees if isinstance(degrees, int) else degrees[:, None])
+    inputs = torch.cat([features, spherical_harmonics(directions) * seen], -1)
+    return torch.relu(linear(torch.relu(linear(inputs, weights.first, weights.first_bias)), weights.second, weights.second_bias))
+
+
+def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees: Tensor | int) -> Tensor:
+    """(R, F), (R, 3) → (R, outputs of all modalities), before the functions that make them light.
+
+    Args:
+        degrees: of the spherical harmonics of the direction that are seen, 0 = none; one number, or (R,) int64.
+    """
+    return linear(hidden_layers(weights, features, directions, degrees), weights.heads, weights.heads_bias)
+
+
+def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Shade rays and compare them with what was measured.
+
+    Args:
+        gain: (M,) factors of the predictions, none: 1.
+    Returns:
+        The photometric loss, a scalar, and the squared residual of every measurement, (M,), without a gradient.
+    """
+    hidden = hidden_layers(weights, rays.features, rays.directions, rays.degrees)
+    hidden = torch.where(rays.trains_geometry[:, None], hidden, hidden.detach())
+    opacity = torch.where(rays.trains_geometry, rays.opacity, rays.opacity.detach())
+    predicted = predict(linear(hidden, weights.heads, weights.heads_bias), opacity, measured)
+    difference = residual(predicted if gain is None else predicted * gain, measured)
+    return photometric(difference, measured), difference.detach().square()
+
+
+def radiance(raw: Tensor) -> Tensor:
+    """Outputs of a radiance head → relative radiance > 0."""
+    return softplus(raw)
+
+
+def intensity(raw: Tensor, axes: Tensor) -> Tensor:
+    """Outputs (..., 6) of a polarization head → relative intensity behind analysers with axes (..., 3): (...)."""
+    # |Lᵀ e|² is eᵀ (L Lᵀ) e without a chance of becoming negative by rounding
+    return (coherency_from_factor(raw).mT @ axes[..., None])[..., 0].square().sum(-1)
+
+
+def predict(outputs: Tensor, opacity: Tensor, measured: Measured) -> Tensor:
+    """What the sensors should have measured: shader outputs (R, outputs) and opacity (R,) → (M,)."""
+    bright = len(measured.ray) - len(measured.axes)
+    value = radiance(outputs[measured.ray[:bright], measured.output[:bright]])
+    if len(measured.axes):
+        factor = measured.output[bright:, None] + torch.arange(6, device=outputs.device)
+        value = torch.cat([value, intensity(outputs[measured.ray[bright:, None], factor], measured.axes)])
+    return value * measured.level * opacity[measured.ray]
+
+
+def residual(predicted: Tensor, measured: Measured) -> Tensor:
+    """predicted - target, where a clipped pixel only says "at least": no residual above a saturated target."""
+    difference = predicted - measured.target
+    return torch.where(measured.target >= measured.saturation, difference.clamp(max=0.0), difference)
+
+
+def photometric(difference: Tensor, measured: Measured) -> Tensor:
+    """Mean over modalities of the Huber loss of residuals relative to the modality's typical value: dark ones count as much."""
+    relative = difference / measured.level
+    return (huber_loss(relative, torch.zeros_like(relative), reduction="none", delta=HUBER_DELTA) * measured.weight).sum()
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Where an unposed frame was taken: against the field.
+"""The pose of a frame that has none, by comparison with the field.
 
 1. ArUco markers (those of ChArUco boards, too) that the scene's training frames show give a pose at once. So do features (SIFT, as
    root-SIFT) of the training frames of the same sensor, each with its place on the field's surface; those of the new frame are matched to
@@ -53,7 +53,7 @@ class Features:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """What a frame can be found by: features of each training frame, and where the corners of markers are, (3,) each."""
+    """What an unposed frame is matched with: features of each training frame, and places of marker corners, (3,) each."""
 
     features: list[Features]
     markers: dict[Corner, np.ndarray]

@@ -57,7 +57,7 @@ def evaluate_conversions(
 
 
 def evaluate_conversion(
-    field: Field, scene: Scene, source: str, target: str, views: Sequence[int] | None = None, progress: Progress | None = None
+    field: Field, scene: Scene, source: str, target: str, *, views: Sequence[int] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Score all methods and baselines of one pair.
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _FOREGROUND_SOURCES = ("masks", "gt", "opacity")
 
 
-def evaluate(field: Field, scene: Scene, views: Sequence[int] | None = None, progress: Progress | None = None) -> dict[str, Any]:
+def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Score a field on test views (definitions: module docstring).
 
     Args:

@@ -83,6 +83,7 @@ def calibrate_noise(
     known: Mapping[str, SensorFile] | None = None,
     raw: Path | None = None,
     views: Sequence[int] | None = None,
+    out: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[dict[str, Calibrated], dict[str, str]]:
     """Noise figures of the sensors of a scene, from its frames and the field.
@@ -93,7 +94,8 @@ def calibrate_noise(
         modalities: None: all. known: sensor files by modality, whose bits, black level and alignment are believed; without, bits are
             those that the frames use, and black is 0. raw: a folder with other frames of the same poses, of any exposure,
             ``raw/MODALITY/0009.png``.
-        views: of which frames; None: the training views, or all that ``raw`` has. progress: called with (rays done, rays in all).
+        views: of which frames; None: the training views, or all that ``raw`` has.
+        out: folder for the sensor files (``write``). progress: called with (rays done, rays in all).
     Returns:
         the figures by modality; and, of modalities whose frames tell nothing (see ``photon_transfer_of_frames``) or whose frames the
         field does not explain, a sentence that says why.
@@ -103,7 +105,7 @@ def calibrate_noise(
     names = field.check_modalities(None if modalities is None else [canonical_modality(m) for m in modalities])
     chosen = {name: _frames(scene, name, raw, views) for name in names}
     count = Counter(progress, sum(f.camera.width * f.camera.height for frames in chosen.values() for f, _ in frames))
-    out, failed = {}, {}
+    calibrated, failed = {}, {}
     for name, frames in chosen.items():
         sensor = field.sensors[name]
         file = (known or {}).get(name) or _assumed(sensor, frames[0][1])
@@ -112,10 +114,12 @@ def calibrate_noise(
             rendered = field.render(frame.camera, field.pose_of(frame), [name], geometry=False, progress=count).channels[name]
             pairs.append((_numbers(path, file), rendered.astype(np.float64) * file.dn_at_one))
         try:
-            out[name] = _calibrated(sensor, file, pairs)
+            calibrated[name] = _calibrated(sensor, file, pairs)
         except InputError as error:
             failed[name] = str(error)
-    return out, failed
+    if out is not None and calibrated:
+        write(calibrated, out)
+    return calibrated, failed
 
 
 def calibrate_from_frames(file: SensorFile, paths: Sequence[Path]) -> Calibrated:

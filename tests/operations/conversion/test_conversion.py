@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from analytic import MONO, MS, POL, RGB, AnalyticField, ring_pose, scene_of, sphere
+from analytic import MONO, MS, POL, RGB, AnalyticField, WrongField, ring_pose, scene_of, sphere
 
 import mmsynth
 from mmsynth.errors import InputError
@@ -23,25 +23,6 @@ from mmsynth.sensors.polarization import angle_of_linear_polarization, degree_of
 
 CAMERA = Camera(96, 72, 100.0, 100.0, 47.3, 35.6, (-0.1, 0.05, 0.001, -0.002))
 POSE = ring_pose(0, 4)
-
-
-def stripes(points_u: np.ndarray, points_v: np.ndarray) -> np.ndarray:
-    return 1.0 + 0.2 * np.sin(points_u / 3.0) * np.cos(points_v / 4.0)
-
-
-class WrongField(AnalyticField):
-    """Its light is off by a pattern, the same in all modalities, as where a shadow or an edge is out of place."""
-
-    wrong = True
-
-    def render(self, camera: Camera, *args: Any, **how: Any) -> Any:
-        seen = super().render(camera, *args, **how)
-        if self.wrong:
-            v, u = np.mgrid[: camera.height, : camera.width]
-            for group in (seen.channels, seen.stokes):
-                for values in group.values():
-                    values /= stripes(u, v)[..., None].astype(np.float32)
-        return seen
 
 
 def truth(target: str, camera: Camera = CAMERA, pose: np.ndarray = POSE) -> Any:

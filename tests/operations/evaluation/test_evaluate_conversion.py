@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import AnalyticField, scene_of, sphere
-from test_conversion import WrongField
+from analytic import AnalyticField, WrongField, scene_of, sphere
 
 from mmsynth.errors import InputError
 from mmsynth.operations.evaluation.conversions import evaluate_conversion
@@ -51,7 +50,7 @@ def test_a_wrong_field_is_mended_and_the_baselines_are_worse(scene: Any) -> None
 def test_raw_frames_will_do(tmp_path: Path) -> None:
     field: Any = _field(WrongField)
     scene = scene_of(field, tmp_path / "scene", views=3, truth=False)
-    found = evaluate_conversion(field, scene, "rgb", "mono", [2])
+    found = evaluate_conversion(field, scene, "rgb", "mono", views=[2])
     assert found["truth"] == "raw" and set(found["methods"]["field"]) == {"psnr"}
     assert all(np.isfinite(m["psnr"]) for m in found["methods"].values())
 
@@ -61,4 +60,4 @@ def test_what_cannot_be_judged_is_refused(scene: Any) -> None:
     with pytest.raises(InputError, match="'thermal': not in this field"):
         evaluate_conversion(field, scene, "rgb", "thermal")
     with pytest.raises(InputError, match="no frames of rgb in the test views"):
-        evaluate_conversion(field, scene, "rgb", "ms", [77])
+        evaluate_conversion(field, scene, "rgb", "ms", views=[77])

@@ -16,7 +16,7 @@ from skimage.measure import marching_cubes
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.field.rendering import Sampling
+from mmsynth.field.kernels import Sampling
 from mmsynth.operations.mesh.extract import Kept, MeshOptions, extract_mesh, settle
 from mmsynth.operations.mesh.marching import march, steepest
 from mmsynth.operations.mesh.quality import describe_mesh

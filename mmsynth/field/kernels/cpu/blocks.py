@@ -15,10 +15,10 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-FEATURES = 4
-FIRST = 4  # rows of a block for the network before the features: x, y, z, 1
-_P1 = np.uint32(2654435761)
-_P2 = np.uint32(805459861)
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, HASH_PRIMES
+
+_P1 = np.uint32(HASH_PRIMES[1])
+_P2 = np.uint32(HASH_PRIMES[2])
 _VECTOR = ir.VectorType(ir.FloatType(), FEATURES)
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 
@@ -132,21 +132,21 @@ def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _level(resolutions, offsets, level):  # type: ignore[no-untyped-def]
+def _level(grid, level):  # type: ignore[no-untyped-def]
     """Cells per axis, index mask, and whether the level is stored densely."""
-    resolution = np.int32(resolutions[level])
-    rows = offsets[level + 1] - offsets[level]
+    resolution = np.int32(grid.resolutions[level])
+    rows = grid.offsets[level + 1] - grid.offsets[level]
     return resolution, np.uint32(rows - 1), (np.int64(resolution) + 1) ** 3 <= rows
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def encode_block(block, n, extent, table, resolutions, offsets, active, first):  # type: ignore[no-untyped-def]
+def encode_block(block, n, grid, first):  # type: ignore[no-untyped-def]
     """Fill the feature rows, which begin at row ``first``, from the position rows."""
-    scale = np.float32(0.5 / extent)
+    scale = np.float32(0.5 / grid.extent)
     xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    for level in range(active):
-        resolution, mask, dense = _level(resolutions, offsets, level)
-        part = table[offsets[level] : offsets[level + 1]]
+    for level in range(grid.active):
+        resolution, mask, dense = _level(grid, level)
+        part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
         row = first + FEATURES * level
         a, b = block[row * n : (row + 1) * n], block[(row + 1) * n : (row + 2) * n]
         c, d = block[(row + 2) * n : (row + 3) * n], block[(row + 3) * n : (row + 4) * n]
@@ -158,13 +158,13 @@ def encode_block(block, n, extent, table, resolutions, offsets, active, first): 
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def scatter_block(block, n, extent, gradient, resolutions, offsets, level, first):  # type: ignore[no-untyped-def]
+def scatter_block(block, n, grid, gradient, level, first):  # type: ignore[no-untyped-def]
     """Add the feature rows of one level, which hold gradients now, to the gradient of its table."""
-    scale = np.float32(0.5 / extent)
+    scale = np.float32(0.5 / grid.extent)
     zero = np.float32(0.0)
     xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    resolution, mask, dense = _level(resolutions, offsets, level)
-    part = gradient[offsets[level] : offsets[level + 1]]
+    resolution, mask, dense = _level(grid, level)
+    part = gradient[grid.offsets[level] : grid.offsets[level + 1]]
     row = first + FEATURES * level
     a, b = block[row * n : (row + 1) * n], block[(row + 1) * n : (row + 2) * n]
     c, d = block[(row + 2) * n : (row + 3) * n], block[(row + 3) * n : (row + 4) * n]
@@ -178,14 +178,14 @@ def scatter_block(block, n, extent, gradient, resolutions, offsets, level, first
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def position_block(block, n, extent, table, resolutions, offsets, active, first, out):  # type: ignore[no-untyped-def]
+def position_block(block, n, grid, first, out):  # type: ignore[no-untyped-def]
     """Add the gradient to the positions that the feature rows, which hold gradients now, imply: out is three rows of n."""
-    scale = np.float32(0.5 / extent)
+    scale = np.float32(0.5 / grid.extent)
     one = np.float32(1.0)
     xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    for level in range(active):
-        resolution, mask, dense = _level(resolutions, offsets, level)
-        part = table[offsets[level] : offsets[level + 1]]
+    for level in range(grid.active):
+        resolution, mask, dense = _level(grid, level)
+        part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
         slope = scale * np.float32(resolution)
         row = first + FEATURES * level
         a, b = block[row * n : (row + 1) * n], block[(row + 1) * n : (row + 2) * n]
@@ -202,34 +202,33 @@ def position_block(block, n, extent, table, resolutions, offsets, active, first,
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def surface_block(  # type: ignore[no-untyped-def]
-    block, hidden, out, n, extent, spheres, table, resolutions, offsets, active, weight, last
-):  # fmt: skip
+def surface_block(block, hidden, out, n, grid, network):  # type: ignore[no-untyped-def]
     """Signed distance of a block: grid, one hidden layer of rectified units, a linear layer, and the initial spheres.
 
-    weight: (H, FIRST + 4 L), H a multiple of four; its columns are the rows of the block. last: (H + 1,), the bias at its end.
+    H is a multiple of four; the columns of the layer's weights are the rows of the block.
     hidden: H rows, kept for the backward pass. out: (n,).
     """
-    encode_block(block, n, extent, table, resolutions, offsets, active, FIRST)
+    encode_block(block, n, grid, FIRST_FEATURE_ROW)
+    weight, output = network.hidden, network.output
     units = weight.shape[0]
     zero = np.float32(0.0)
     xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    inner, outer = spheres[0], spheres[1]
+    inner, outer = network.inner_radius, network.outer_radius
     for i in range(n):
         r = np.float32(math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i]))
-        out[i] = last[units] + min(r - inner, outer - r)
+        out[i] = output[units] + min(r - inner, outer - r)
     for k in range(units):
         h = hidden[k * n : (k + 1) * n]
         w0, w1, w2, w3 = weight[k, 0], weight[k, 1], weight[k, 2], weight[k, 3]
         for i in range(n):
             h[i] = xs[i] * w0 + ys[i] * w1 + zs[i] * w2 + w3
-        for j in range(FIRST, FIRST + FEATURES * active, 4):
+        for j in range(FIRST_FEATURE_ROW, FIRST_FEATURE_ROW + FEATURES * grid.active, 4):
             f0, f1 = block[j * n : (j + 1) * n], block[(j + 1) * n : (j + 2) * n]
             f2, f3 = block[(j + 2) * n : (j + 3) * n], block[(j + 3) * n : (j + 4) * n]
             w0, w1, w2, w3 = weight[k, j], weight[k, j + 1], weight[k, j + 2], weight[k, j + 3]
             for i in range(n):
                 h[i] += f0[i] * w0 + f1[i] * w1 + f2[i] * w2 + f3[i] * w3
-        w = last[k]
+        w = output[k]
         for i in range(n):
             v = max(h[i], zero)
             h[i] = v
@@ -237,28 +236,29 @@ def surface_block(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def surface_block_backward(block, hidden, g, n, active, weight, last, row, weight_out, last_out):  # type: ignore[no-untyped-def]
+def surface_block_backward(block, hidden, g, n, active, network, row, hidden_out, output_out):  # type: ignore[no-untyped-def]
     """Gradients of a block for gradients g (n,) of its distances.
 
     The weights' gradients are added to. Hidden and feature rows are replaced by their gradients. row: scratch of n numbers.
     """
+    weight, output = network.hidden, network.output
     units = weight.shape[0]
     zero = np.float32(0.0)
     total = zero
     for i in range(n):
         total += g[i]
-    last_out[units] += total
+    output_out[units] += total
     for k in range(units):
         h = hidden[k * n : (k + 1) * n]
-        w = last[k]
+        w = output[k]
         s0, s1 = zero, zero
         for i in range(n):
             s0 += h[i] * g[i]
             h[i] = w * g[i] if h[i] > zero else zero
             s1 += h[i]
-        last_out[k] += s0
-        weight_out[k, 3] += s1
-    for j in range(FIRST + FEATURES * active):
+        output_out[k] += s0
+        hidden_out[k, 3] += s1
+    for j in range(FIRST_FEATURE_ROW + FEATURES * active):
         if j == 3:
             continue
         f = block[j * n : (j + 1) * n]
@@ -277,26 +277,27 @@ def surface_block_backward(block, hidden, g, n, active, weight, last, row, weigh
                 s2 += c * v
                 s3 += d * v
                 row[i] += a * w0 + b * w1 + c * w2 + d * w3
-            weight_out[k, j] += s0
-            weight_out[k + 1, j] += s1
-            weight_out[k + 2, j] += s2
-            weight_out[k + 3, j] += s3
-        if j >= FIRST:
+            hidden_out[k, j] += s0
+            hidden_out[k + 1, j] += s1
+            hidden_out[k + 2, j] += s2
+            hidden_out[k + 3, j] += s3
+        if j >= FIRST_FEATURE_ROW:
             for i in range(n):
                 f[i] = row[i]
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def surface_block_positions(block, hidden, g, n, extent, spheres, table, resolutions, offsets, active, weight, out):  # type: ignore[no-untyped-def]
+def surface_block_positions(block, hidden, g, n, grid, network, out):  # type: ignore[no-untyped-def]
     """After ``surface_block_backward``: gradient to the positions, out: three rows of n, overwritten."""
     xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    inner, outer = spheres[0], spheres[1]
+    inner, outer = network.inner_radius, network.outer_radius
     for i in range(n):
         r = np.float32(math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i]))
         away = g[i] / max(r, np.float32(1e-12))
         if outer - r < r - inner:
             away = -away
         out[i], out[n + i], out[2 * n + i] = away * xs[i], away * ys[i], away * zs[i]
+    weight = network.hidden
     for k in range(weight.shape[0]):
         h = hidden[k * n : (k + 1) * n]
         w0, w1, w2 = weight[k, 0], weight[k, 1], weight[k, 2]
@@ -304,4 +305,4 @@ def surface_block_positions(block, hidden, g, n, extent, spheres, table, resolut
             out[i] += w0 * h[i]
             out[n + i] += w1 * h[i]
             out[2 * n + i] += w2 * h[i]
-    position_block(block, n, extent, table, resolutions, offsets, active, FIRST, out)
+    position_block(block, n, grid, FIRST_FEATURE_ROW, out)

@@ -4,12 +4,13 @@ Work is cut into chunks of ``CHUNK`` rays, which pass the layers of the shader a
 shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights are summed per
 chunk and the chunks in order, whatever the number of threads.
 
-Matrices have whole tiles: they are padded with zeros, rows to a multiple of ``TALL``, columns to one of ``WIDE``.
+Matrices have whole tiles: they are padded with zeros, rows to a multiple of ``TILE_ROWS``, columns to one of ``TILE_COLS``.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -17,14 +18,14 @@ from numba import get_thread_id, njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
 from mmsynth.field.kernels.cpu.blocks import splat
 
 CHUNK = 64  # rays
-TALL, WIDE = 4, 16
-TERMS = 16  # spherical harmonics up to degree 3
-HUBER = np.float32(0.5)  # as in losses.photometric
+TILE_ROWS, TILE_COLS = 4, 16
+_HUBER = np.float32(HUBER_DELTA)
 _FAST = {"contract", "reassoc", "nsz", "arcp"}  # but NaN stays NaN: a loss that is not finite must be seen
-_VECTOR = ir.VectorType(ir.FloatType(), WIDE)
+_VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
 _BYTE, _I64 = ir.IntType(8), ir.IntType(64)
 
 
@@ -35,7 +36,7 @@ def _add_tile(typingctx, a, b, out, row, inner, column):  # type: ignore[no-unty
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         row, inner, column = args[3:]
         zero = ir.Constant(_I64, 0)
-        rows = [ir.Constant(_I64, r) for r in range(TALL)]
+        rows = [ir.Constant(_I64, r) for r in range(TILE_ROWS)]
 
         def element(which, i, j):  # type: ignore[no-untyped-def]
             """Address of an element, and its array's strides."""
@@ -69,8 +70,8 @@ def _add_tile(typingctx, a, b, out, row, inner, column):  # type: ignore[no-unty
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def]
     """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
-    for row in range(0, rows, TALL):
-        for column in range(0, columns, WIDE):
+    for row in range(0, rows, TILE_ROWS):
+        for column in range(0, columns, TILE_COLS):
             _add_tile(a, b, out, row, inner, column)
 
 
@@ -90,7 +91,7 @@ def _whole(count, of):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _padded(matrix):  # type: ignore[no-untyped-def]
     """A copy of whole tiles, whichever way round it is used."""
-    out = np.zeros((_whole(matrix.shape[0], WIDE), _whole(matrix.shape[1], WIDE)), np.float32)
+    out = np.zeros((_whole(matrix.shape[0], TILE_COLS), _whole(matrix.shape[1], TILE_COLS)), np.float32)
     for i in range(matrix.shape[0]):
         for j in range(matrix.shape[1]):
             out[i, j] = matrix[i, j]
@@ -99,7 +100,7 @@ def _padded(matrix):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
-    """Real spherical harmonics (see ``encoding.spherical_harmonics``); terms above the degree are left as they are."""
+    """Real spherical harmonics (see ``reference.spherical_harmonics``); terms above the degree are left as they are."""
     f = np.float32
     out[0] = f(0.28209479177387814)
     if degree < 1:
@@ -129,7 +130,7 @@ def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
 def _layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
     """out = rectified (x @ weight + bias), of n rays. weight: (inputs, units)."""
-    rows, units = _whole(n, TALL), out.shape[1]
+    rows, units = _whole(n, TILE_ROWS), out.shape[1]
     _clear(out, rows, units)
     for i in range(n):
         for k in range(len(bias)):
@@ -162,7 +163,7 @@ def _softplus(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
-    """|Lᵀ e|² (see ``radiance.intensity``) and its slope, both of six numbers."""
+    """|Lᵀ e|² (see ``reference.intensity``) and its slope, both of six numbers."""
     two = np.float32(2.0)
     a, slope_a = _softplus(raw[0])
     b, slope_b = _softplus(raw[1])
@@ -176,19 +177,20 @@ def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
-def _numbers(  # type: ignore[no-untyped-def]
-    begin, numbers, hidden, opacity, teaches, target, ray, output, axes, level, saturation, weight, gain, heads, heads_bias,
-    learn, squared, g_hidden, g_opacity, g_gain, heads_out, heads_bias_out,
-):  # fmt: skip
+def _measurements(  # type: ignore[no-untyped-def]
+    begin, span, hidden, rays, measured, gain, heads, heads_bias, learn, squared, g_hidden, g_opacity, g_gain, heads_out, heads_bias_out
+):
     """What was measured along the rays of a chunk, of which ``begin`` is the first: the loss. Gradients are added to.
 
-    numbers: the first, and where they end. hidden: (n, H), a row per ray.
+    span: of the measurements, the first and where they end. hidden: (n, H), a row per ray.
     """
+    opacity, trains_geometry = rays.opacity, rays.trains_geometry
+    target, ray, output, axes, level = measured.target, measured.ray, measured.output, measured.axes, measured.level
     raw, slope = np.empty(6, np.float32), np.empty(6, np.float32)
     bright = len(ray) - len(axes)
     units = heads.shape[1]
     loss = 0.0
-    for m in range(numbers[0], numbers[1]):
+    for m in range(span[0], span[1]):
         o, first = ray[m], output[m]
         h, g = hidden[o - begin], g_hidden[o - begin]
         outputs = 1 if m < bright else 6
@@ -207,19 +209,19 @@ def _numbers(  # type: ignore[no-untyped-def]
             brightness *= gain[m]
         difference = light * brightness * opacity[o] - target[m]
         # a clipped pixel only says "at least"
-        if target[m] >= saturation[m] and difference > np.float32(0.0):
+        if target[m] >= measured.saturation[m] and difference > np.float32(0.0):
             difference = np.float32(0.0)
         squared[m] = difference * difference
         relative = difference / level[m]
         size = abs(relative)
-        huber = np.float32(0.5) * size * size if size < HUBER else HUBER * (size - np.float32(0.5) * HUBER)
-        loss += np.float64(weight[m] * huber)
+        huber = np.float32(0.5) * size * size if size < _HUBER else _HUBER * (size - np.float32(0.5) * _HUBER)
+        loss += np.float64(measured.weight[m] * huber)
         if not learn:
             continue
-        pull = weight[m] / level[m] * min(max(relative, -HUBER), HUBER)
+        pull = measured.weight[m] / level[m] * min(max(relative, -_HUBER), _HUBER)
         if len(gain):
             g_gain[m] = pull * light * level[m] * opacity[o]
-        if teaches[o]:
+        if trains_geometry[o]:
             g_opacity[o] += pull * light * brightness
         for j in range(outputs):
             w, w_out = heads[first + j], heads_out[first + j]
@@ -227,7 +229,7 @@ def _numbers(  # type: ignore[no-untyped-def]
             heads_bias_out[first + j] += p
             for k in range(units):
                 w_out[k] += p * h[k]
-            if teaches[o]:
+            if trains_geometry[o]:
                 for k in range(units):
                     g[k] += p * w[k]
     return loss
@@ -235,7 +237,7 @@ def _numbers(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _first_at(ray, begin):  # type: ignore[no-untyped-def]
-    """The first number of a ray or of those after it, by bisection."""
+    """The first measurement of a ray or of those after it, by bisection."""
     low, high = 0, len(ray)
     while low < high:
         middle = (low + high) // 2
@@ -246,19 +248,31 @@ def _first_at(ray, begin):  # type: ignore[no-untyped-def]
     return low
 
 
+class Layers(NamedTuple):
+    """Weights of the two hidden layers, padded to whole tiles, (units, inputs) and turned to (inputs, units)."""
+
+    first: np.ndarray
+    first_turned: np.ndarray
+    first_bias: np.ndarray
+    second: np.ndarray
+    second_turned: np.ndarray
+    second_bias: np.ndarray
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _chunk(  # type: ignore[no-untyped-def]
-    begin, n, features, opacity, directions, degrees, teaches, target, ray, output, axes, level, saturation, weight, gain,
-    first, first_turned, first_bias, second, second_turned, second_bias, heads, heads_bias, learn,
-    x, h1, h2, g1, g2, squared, g_features, g_opacity, g_gain,
-    first_out, first_bias_out, second_out, second_bias_out, heads_out, heads_bias_out,
-):  # fmt: skip
+    begin, n, slot, chunk, rays, measured, gain, layers, heads, heads_bias, learn, store, squared, g_features, g_opacity, g_gain
+):
     """The loss of n rays, and its gradients where ``learn``."""
+    x, h1, h2, g1, g2 = store.x[slot], store.h1[slot], store.h2[slot], store.g1[slot], store.g2[slot]
+    first_out, first_bias_out, second_out = store.first_out[chunk], store.first_bias_out[chunk], store.second_out[chunk]
+    second_bias_out, heads_out, heads_bias_out = store.second_bias_out[chunk], store.heads_out[chunk], store.heads_bias_out[chunk]
+    features, directions, degrees = rays.features, rays.directions, rays.degrees
     width = features.shape[1]
     degree = np.int64(0)
     for i in range(n):
         degree = max(degree, degrees[begin + i])  # terms of a higher one than any here are zero
-    rows, inputs, used = _whole(n, TALL), _whole(width + (TERMS if degree else 1), WIDE), _whole(width, WIDE)
+    rows, inputs, used = _whole(n, TILE_ROWS), _whole(width + (HARMONICS if degree else 1), TILE_COLS), _whole(width, TILE_COLS)
     units = h1.shape[1]
     _clear(x, rows, inputs)
     _clear(g2, rows, units)
@@ -268,23 +282,22 @@ def _chunk(  # type: ignore[no-untyped-def]
             x[i, j] = features[o, j]
         _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degrees[o], x[i, width:])
         g_opacity[o] = np.float32(0.0)
-    _layer(n, x, inputs, first_turned, first_bias, h1)
-    _layer(n, h1, units, second_turned, second_bias, h2)
+    _layer(n, x, inputs, layers.first_turned, layers.first_bias, h1)
+    _layer(n, h1, units, layers.second_turned, layers.second_bias, h2)
     if learn:
         first_out[:], second_out[:], heads_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         first_bias_out[:], second_bias_out[:], heads_bias_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    numbers = _first_at(ray, begin), _first_at(ray, begin + n)
-    loss = _numbers(
-        begin, numbers, h2, opacity, teaches, target, ray, output, axes, level, saturation, weight, gain, heads, heads_bias,
-        learn, squared, g2, g_opacity, g_gain, heads_out, heads_bias_out,
-    )  # fmt: skip
+    span = _first_at(measured.ray, begin), _first_at(measured.ray, begin + n)
+    loss = _measurements(
+        begin, span, h2, rays, measured, gain, heads, heads_bias, learn, squared, g2, g_opacity, g_gain, heads_out, heads_bias_out
+    )
     if learn:
         _layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
         _clear(g1, rows, units)
-        _add_product(g2, second, g1, rows, units, units)
+        _add_product(g2, layers.second, g1, rows, units, units)
         _layer_backward(n, x, inputs, g1, h1, first_out, first_bias_out)
         _clear(x, rows, used)
-        _add_product(g1, first, x, rows, units, used)
+        _add_product(g1, layers.first, x, rows, units, used)
         for i in range(n):
             for j in range(width):
                 g_features[begin + i, j] = x[i, j]
@@ -292,37 +305,30 @@ def _chunk(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def compare(  # type: ignore[no-untyped-def]
-    features, opacity, directions, degrees, teaches, target, ray, output, axes, level, saturation, weight, gain,
-    first, first_bias, second, second_bias, heads, heads_bias, learn, x_of, h1_of, h2_of, g1_of, g2_of,
-    loss, squared, g_features, g_opacity, g_gain,
-    first_out, first_bias_out, second_out, second_bias_out, heads_out, heads_bias_out,
-):  # fmt: skip
-    """See ``losses.compare``. ``ray`` never decreases; ``gain`` may be empty; the loss and gradients of weights are per chunk.
+def compare(rays, measured, gain, weights, learn, store, loss, squared, g_features, g_opacity, g_gain):  # type: ignore[no-untyped-def]
+    """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` may be empty; the loss and gradients of weights are per chunk.
 
-    Scratch, a slot per thread: x_of (what goes into the shader), h1_of, h2_of (its hidden layers), g1_of, g2_of (their gradients).
+    store: ``ShadingStore``, whose scratch has a slot per thread.
     """
-    rays = len(features)
-    first_padded, first_turned = _padded(first), _padded(first.T)
-    second_padded, second_turned = _padded(second), _padded(second.T)
-    for task in prange((rays + CHUNK - 1) // CHUNK):
+    total = len(rays.features)
+    layers = Layers(
+        _padded(weights.first), _padded(weights.first.T), weights.first_bias,
+        _padded(weights.second), _padded(weights.second.T), weights.second_bias,
+    )  # fmt: skip
+    for task in prange((total + CHUNK - 1) // CHUNK):
         chunk, slot = np.int64(task), np.int64(get_thread_id())
         begin = chunk * CHUNK
         loss[chunk] = _chunk(
-            begin, min(CHUNK, rays - begin), features, opacity, directions, degrees, teaches,
-            target, ray, output, axes, level, saturation, weight, gain,
-            first_padded, first_turned, first_bias, second_padded, second_turned, second_bias, heads, heads_bias, learn,
-            x_of[slot], h1_of[slot], h2_of[slot], g1_of[slot], g2_of[slot], squared, g_features, g_opacity, g_gain,
-            first_out[chunk], first_bias_out[chunk], second_out[chunk], second_bias_out[chunk], heads_out[chunk], heads_bias_out[chunk],
+            begin, min(CHUNK, total - begin), slot, chunk, rays, measured, gain, layers, weights.heads, weights.heads_bias,
+            learn, store, squared, g_features, g_opacity, g_gain,
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shade_chunk(  # type: ignore[no-untyped-def]
-    begin, n, features, directions, degree, first, first_bias, second, second_bias, heads, heads_bias, outputs
-):  # fmt: skip
-    """Outputs of n rays. Matrices have a column per unit, and whole tiles."""
-    width, rows = features.shape[1], _whole(n, TALL)
+def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
+    """Outputs of n rays. heads: (H, outputs), whole tiles."""
+    first, second = layers.first_turned, layers.second_turned
+    width, rows = features.shape[1], _whole(n, TILE_ROWS)
     x = np.zeros((rows, first.shape[0]), np.float32)
     h1, h2 = np.empty((rows, first.shape[1]), np.float32), np.empty((rows, second.shape[1]), np.float32)
     out = np.zeros((rows, heads.shape[1]), np.float32)
@@ -331,8 +337,8 @@ def _shade_chunk(  # type: ignore[no-untyped-def]
         for j in range(width):
             x[i, j] = features[o, j]
         _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degree, x[i, width:])
-    _layer(n, x, _whole(width + (TERMS if degree else 1), WIDE), first, first_bias, h1)
-    _layer(n, h1, h1.shape[1], second, second_bias, h2)
+    _layer(n, x, _whole(width + (HARMONICS if degree else 1), TILE_COLS), first, layers.first_bias, h1)
+    _layer(n, h1, h1.shape[1], second, layers.second_bias, h2)
     _add_product(h2, heads, out, rows, h2.shape[1], out.shape[1])
     for i in range(n):
         for k in range(len(heads_bias)):
@@ -340,15 +346,13 @@ def _shade_chunk(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def shade(  # type: ignore[no-untyped-def]
-    features, directions, degree, first, first_bias, second, second_bias, heads, heads_bias, outputs
-):  # fmt: skip
-    """See ``radiance.Shader.forward``, of rays that all have one degree."""
+def shade(features, directions, degree, weights, outputs):  # type: ignore[no-untyped-def]
+    """See ``reference.shade``, of rays that all have one degree."""
     rays = len(features)
-    first_turned, second_turned, heads_turned = _padded(first.T), _padded(second.T), _padded(heads.T)
+    layers = Layers(
+        weights.first, _padded(weights.first.T), weights.first_bias, weights.second, _padded(weights.second.T), weights.second_bias
+    )
+    heads = _padded(weights.heads.T)
     for task in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(task) * CHUNK
-        _shade_chunk(
-            begin, min(CHUNK, rays - begin), features, directions, degree,
-            first_turned, first_bias, second_turned, second_bias, heads_turned, heads_bias, outputs,
-        )  # fmt: skip
+        _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, heads, weights.heads_bias, outputs)

@@ -1,0 +1,20 @@
+"""Numbers that every back end has to agree on; each stands here and nowhere else."""
+
+# states of an occupancy cell; above OUTSIDE, how many half cells around it are certainly free
+SHELL, SOLID, OUTSIDE = 0, 1, 2
+
+FEATURES = 4  # per level of a hash grid, on the CPU: a row of a table is one vector register
+HASH_PRIMES = (1, 2654435761, 805459861)  # along x, y, z (Müller et al. 2022, eq. 4)
+FIRST_FEATURE_ROW = 4  # of what goes into the surface's network: x, y, z, 1, then features; columns of its weights alike
+
+MAX_SAMPLES_PER_RAY = 96
+LONGEST_STEP = 0.25  # of the distance from the centre, in contracted space
+LEAST_ADVANCE = 1.0 + 2.0**-22  # factor that a float32 moves on by at least: a short step far from a ray's origin may round to none
+SOFT_SURFACE = 3.0  # times 1 / sharpness: how far from the surface a ray may not yet stride
+FACE_OVERSHOOT = 0.1  # of a step, behind the face of a free cell
+NO_CROSSING = 1e9  # distance to a face that a ray runs along; it does so below a velocity of ALONG_FACE
+ALONG_FACE = 1e-9
+
+HARMONICS = 16  # spherical harmonics up to degree 3
+HUBER_DELTA = 0.5  # relative residuals above it count linearly
+LEAST_WEIGHT = 1e-12  # of a ray's sections, by which its features are divided

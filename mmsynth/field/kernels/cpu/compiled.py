@@ -1,0 +1,24 @@
+"""The kernels of a fit, and whether they have code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mmsynth.field.kernels.cpu import marching, optimiser, shading, surface, tracing_gradients
+
+KERNELS = (
+    surface.surface_forward, surface.surface_backward, surface.surface_scatter,
+    marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
+    shading.compare, shading.shade, optimiser.adam_parts, optimiser.adam_part,
+)  # fmt: skip
+
+
+def is_compiled() -> bool:
+    """Whether every kernel has code for its usual types, in this process or in the cache on disk."""
+    return all(k.signatures or _cached(k) for k in KERNELS)
+
+
+def _cached(kernel: Any) -> bool:
+    # numba writes one index file per function and source version; it is missing exactly when the kernel was never compiled
+    cache = kernel._cache._cache_file
+    return bool(cache.load_index() if hasattr(cache, "load_index") else cache._load_index())

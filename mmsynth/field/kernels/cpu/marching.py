@@ -1,0 +1,301 @@
+"""Rays through the field on the CPU, fused: marching, distances, sections, appearance and composition in one pass.
+
+Work is cut into chunks of ``CHUNK`` rays. Within a chunk up to ``LANES`` rays are under way; each round takes the next sample
+of every one of them, so that grid and network see blocks of up to ``LANES`` positions (see ``blocks``), and a lane whose ray has
+ended takes the next ray that waits. What the backward pass needs stays where the forward pass wrote it, in the ``RayStore``: in the
+chunk's slot when ``keep``, in the thread's otherwise.
+
+Every sum has a fixed order, whatever the number of threads: chunks are summed in order, and tables are filled level by level.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import get_thread_id, njit, prange
+
+from mmsynth.field.kernels.constants import (
+    ALONG_FACE,
+    FACE_OVERSHOOT,
+    FEATURES,
+    FIRST_FEATURE_ROW,
+    LEAST_ADVANCE,
+    LEAST_WEIGHT,
+    LONGEST_STEP,
+    MAX_SAMPLES_PER_RAY,
+    NO_CROSSING,
+    OUTSIDE,
+    SOFT_SURFACE,
+    SOLID,
+)
+from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
+
+CHUNK = 256  # rays
+LANES = 64
+_LONGEST_STEP = np.float32(LONGEST_STEP)
+_LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
+_LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
+_NO_CROSSING = np.float32(NO_CROSSING)
+_FACE_OVERSHOOT = np.float32(FACE_OVERSHOOT)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _softplus(x):  # type: ignore[no-untyped-def]
+    if abs(x) > 40.0:  # exp(-40) is below the rounding of 1
+        return max(x, 0.0)
+    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _contract(x, y, z):  # type: ignore[no-untyped-def]
+    """Contracted position (mip-NeRF 360, eq. 10) and the distance from the centre."""
+    r = np.float32(math.sqrt(x * x + y * y + z * z))
+    if r <= np.float32(1.0):
+        return x, y, z, r
+    k = (np.float32(2.0) - np.float32(1.0) / r) / r
+    return x * k, y * k, z * k, r
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Change of the contracted position per unit of ray distance, for a point at distance r from the centre."""
+    if r <= np.float32(1.0):
+        return dx, dy, dz
+    ux, uy, uz = x / r, y / r, z / r
+    along = ux * dx + uy * dy + uz * dz
+    across = (np.float32(2.0) * r - np.float32(1.0)) / (r * r)
+    radial = along * (np.float32(1.0) / (r * r) - across)
+    return dx * across + ux * radial, dy * across + uy * radial, dz * across + uz * radial
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contracted):  # type: ignore[no-untyped-def]
+    """The first place at or after t where a surface may be: t, position, speed there, state; t >= far when there is none."""
+    grid = states.shape[0]
+    half = np.float32(0.5 * grid / extent)
+    skipped = False
+    while t < far:
+        x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+        r = np.float32(0.0)
+        if contracted:
+            cx, cy, cz, r = _contract(x, y, z)
+            vx, vy, vz = _velocity(x, y, z, r, dx, dy, dz)
+        else:
+            cx, cy, cz, vx, vy, vz = x, y, z, dx, dy, dz
+        speed = np.float32(math.sqrt(vx * vx + vy * vy + vz * vz))
+        ix = min(max(int((cx + extent) * half), 0), grid - 1)
+        iy = min(max(int((cy + extent) * half), 0), grid - 1)
+        iz = min(max(int((cz + extent) * half), 0), grid - 1)
+        state = states[ix, iy, iz]
+        if state < OUTSIDE:
+            if skipped:  # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
+                t += jitter * step / speed
+                x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+                if contracted:
+                    cx, cy, cz, _ = _contract(x, y, z)
+                else:
+                    cx, cy, cz = x, y, z
+            return t, cx, cy, cz, r, speed, state
+        skipped = True
+        leave = _NO_CROSSING
+        if abs(vx) > ALONG_FACE:
+            leave = min(leave, (np.float32(ix + (1 if vx > 0 else 0)) / half - extent - cx) / vx)
+        if abs(vy) > ALONG_FACE:
+            leave = min(leave, (np.float32(iy + (1 if vy > 0 else 0)) / half - extent - cy) / vy)
+        if abs(vz) > ALONG_FACE:
+            leave = min(leave, (np.float32(iz + (1 if vz > 0 else 0)) / half - extent - cz) / vz)
+        # the cell's certificate may reach beyond it
+        leave = max(leave, np.float32(state - OUTSIDE) / (half * speed * np.float32(2.0))) + _FACE_OVERSHOOT * step / speed
+        if contracted:
+            leave = min(leave, _LONGEST_STEP * max(r, np.float32(1.0)))
+        t = max(t + leave, t * _LEAST_ADVANCE)
+    return far, np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(1.0), np.uint8(0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _to_rows(block, n):  # type: ignore[no-untyped-def]
+    """x y z x y z ... → a row of x, of y, of z."""
+    copy = block[: 3 * n].copy()
+    for i in range(n):
+        block[i] = copy[3 * i]
+        block[n + i] = copy[3 * i + 1]
+        block[2 * n + i] = copy[3 * i + 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _march(begin, count, slot, rays, states, sampling, grid, network, store):  # type: ignore[no-untyped-def]
+    """Samples of the rays of a chunk and their distances, see ``reference.march``: how many."""
+    size = FIRST_FEATURE_ROW + FEATURES * grid.resolutions.shape[0]
+    units = network.hidden.shape[0]
+    contracted = grid.extent > np.float32(1.0)
+    sharpness, step, factor = sampling.sharpness, np.float32(sampling.step), np.float32(sampling.sphere_step_factor)
+    min_slope = np.float32(sampling.min_slope)
+    origins, directions = rays.origins, rays.directions
+    t_of, f_of, p_of, counts = store.t_of, store.f_of, store.p_of, store.counts
+    # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
+    where = np.empty(CHUNK, np.float32)
+    tau_of = np.empty(CHUNK, np.float64)
+    speed_of = np.empty(CHUNK, np.float32)
+    reach_of = np.empty(CHUNK, np.float32)
+    state_of = np.empty(CHUNK, np.uint8)
+    lanes = np.empty(LANES, np.int32)
+    going = 0
+    waiting = 0
+    used = 0
+    blocks = 0
+    while going > 0 or waiting < count:
+        n = np.int64(0)
+        f = store.block[slot, used * size :]
+        taken = 0
+        while n < LANES and (taken < going or waiting < count):
+            if taken < going:
+                i = lanes[taken]
+                taken += 1
+            else:
+                i = np.int32(waiting)
+                waiting += 1
+                where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
+                tau_of[i] = 0.0
+                counts[slot, i] = 0
+            o = begin + i
+            t, x, y, z, r, speed, state = _advance(
+                origins[o, 0], origins[o, 1], origins[o, 2], directions[o, 0], directions[o, 1], directions[o, 2],
+                where[i], rays.far[o], rays.jitter[o], step, states, grid.extent, contracted,
+            )  # fmt: skip
+            if t >= rays.far[o]:
+                continue
+            where[i] = t
+            speed_of[i], reach_of[i], state_of[i] = speed, r, state
+            lanes[n] = i
+            # rows are laid out once n is known
+            f[3 * n], f[3 * n + 1], f[3 * n + 2] = x, y, z
+            n += 1
+        if n == 0:
+            break
+        _to_rows(f, n)
+        for i in range(3 * n, 4 * n):
+            f[i] = np.float32(1.0)
+        surface_block(f, store.hidden[slot, used * units :], store.sdf[slot, used : used + n], n, grid, network)
+        going = 0
+        for a in range(n):
+            i = lanes[a]
+            k = counts[slot, i]
+            value = store.sdf[slot, used + a]
+            t = where[i]
+            here = i * MAX_SAMPLES_PER_RAY + k
+            t_of[slot, here] = t
+            f_of[slot, here] = value
+            p_of[slot, here] = _softplus(-sharpness * np.float64(value))
+            store.id_of[slot, here] = used + a
+            store.ray_of[slot, used + a] = i
+            store.time_of[slot, used + a] = t
+            slope = np.float32(1.0)
+            if k > 0:
+                tau_of[i] += max(0.0, p_of[slot, here] - p_of[slot, here - 1])
+                slope = (f_of[slot, here - 1] - value) / ((t - t_of[slot, here - 1]) * speed_of[i])
+            counts[slot, i] = k + 1
+            if tau_of[i] > sampling.max_optical_depth or k + 1 == MAX_SAMPLES_PER_RAY or (state_of[i] == SOLID and k > 0):
+                continue
+            # the step that changes the distance by about ``step``: long where the ray grazes, and long far from the surface
+            jump = step / max(slope, min_slope)
+            if value > 0:
+                jump = max(jump, factor * (value - np.float32(SOFT_SURFACE / sharpness)))
+            jump = jump / speed_of[i]
+            if contracted:
+                jump = min(jump, _LONGEST_STEP * max(reach_of[i], np.float32(1.0)))
+            where[i] = t + jump
+            lanes[going] = i
+            going += 1
+        store.sizes[slot, blocks] = n
+        blocks += 1
+        used += int(n)
+    store.rounds[slot, 0] = blocks
+    return used
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_sections(begin, count, slot, rays, contracted, sampling, store, opacity, depth):  # type: ignore[no-untyped-def]
+    """Weights of the sections of a chunk's rays: opacity, depth, and the sections that matter, in the order of the rays: how many."""
+    min_weight = np.float32(sampling.min_section_weight)
+    origins, directions = rays.origins, rays.directions
+    t_of, f_of, p_of, s_block = store.t_of, store.f_of, store.p_of, store.s_block
+    sections = np.int64(0)  # as a literal, blocks would be compiled for it, too
+    for i in range(count):
+        o = begin + i
+        tau_sum = 0.0
+        before = 0.0
+        depth[o] = np.float32(np.nan)
+        for k in range(store.counts[slot, i] - 1):
+            here = i * MAX_SAMPLES_PER_RAY + k
+            tau = p_of[slot, here + 1] - p_of[slot, here]
+            if tau < 1e-7:
+                continue
+            f0 = f_of[slot, here]
+            f1 = f_of[slot, here + 1]
+            w = math.exp(-tau_sum) * -math.expm1(-tau)
+            tau_sum += tau
+            if tau_sum > sampling.max_optical_depth:  # the ray was ended here: what is left belongs to this surface, too
+                w += math.exp(-tau_sum)
+            if w > min_weight or (before < 0.5 and before + w >= 0.5):
+                crossing = np.float32(0.5)
+                if f0 > 0 and f1 <= 0:
+                    crossing = f0 / (f0 - f1)
+                t0 = t_of[slot, here]
+                t = t0 + crossing * (t_of[slot, here + 1] - t0)
+                if before < 0.5 and before + w >= 0.5:
+                    depth[o] = t
+                if w > min_weight:
+                    x = origins[o, 0] + directions[o, 0] * t
+                    y = origins[o, 1] + directions[o, 1] * t
+                    z = origins[o, 2] + directions[o, 2] * t
+                    if contracted:
+                        x, y, z, _ = _contract(x, y, z)
+                    s_block[slot, 3 * sections] = x
+                    s_block[slot, 3 * sections + 1] = y
+                    s_block[slot, 3 * sections + 2] = z
+                    store.s_ray[slot, sections] = i
+                    store.s_k[slot, sections] = k
+                    store.s_time[slot, sections] = t
+                    store.s_weight[slot, sections] = w
+                    sections += 1
+            before += w
+        opacity[o] = before
+    store.s_count[slot, 0] = sections
+    return sections
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _composite(begin, count, slot, sections, appearance, store, features, shown):  # type: ignore[no-untyped-def]
+    """Features of a chunk's rays: the mean over their sections."""
+    s_block, width = store.s_block, FEATURES * appearance.active
+    _to_rows(s_block[slot], sections)
+    encode_block(s_block[slot], sections, appearance, 3)
+    for i in range(count):
+        shown[begin + i] = np.float32(0.0)
+        for j in range(FEATURES * appearance.resolutions.shape[0]):
+            features[begin + i, j] = np.float32(0.0)
+    for s in range(sections):
+        o = begin + store.s_ray[slot, s]
+        w = store.s_weight[slot, s]
+        shown[o] += w
+        for j in range(width):
+            features[o, j] += w * s_block[slot, (3 + j) * sections + s]
+    for i in range(count):
+        scale = np.float32(1.0) / max(shown[begin + i], _LEAST_WEIGHT)
+        for j in range(width):
+            features[begin + i, j] *= scale
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def trace_forward(rays, states, sampling, grid, network, appearance, keep, store, out):  # type: ignore[no-untyped-def]
+    """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
+    total, samples = rays.origins.shape[0], out.samples  # in a parallel loop, numba would not set a tuple's arrays
+    for chunk in prange((total + CHUNK - 1) // CHUNK):
+        slot = np.int64(chunk) if keep else np.int64(get_thread_id())
+        begin = np.int64(chunk) * CHUNK
+        count = min(CHUNK, total - begin)
+        samples[chunk] = _march(begin, count, slot, rays, states, sampling, grid, network, store)
+        contracted = grid.extent > np.float32(1.0)
+        sections = _find_sections(begin, count, slot, rays, contracted, sampling, store, out.opacity, out.depth)
+        _composite(begin, count, slot, sections, appearance, store, out.features, out.shown)

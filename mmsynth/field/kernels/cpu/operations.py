@@ -1,0 +1,207 @@
+"""What numba compiled, behind torch's autograd.
+
+Tables are the largest tensors of a field and few of their rows are met in one step, so their gradients are *added to*
+``table.grad`` in place and not returned to autograd: a dense gradient per call would cost more than the call. Everything else
+follows autograd's rules.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numba import get_num_threads
+from torch import Tensor
+
+from mmsynth.field.kernels import reference
+from mmsynth.field.kernels.constants import FEATURES
+from mmsynth.field.kernels.cpu import marching, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.marching import CHUNK
+from mmsynth.field.kernels.cpu.stores import RayStore, SurfaceStore, ray_store, shading_store, surface_store
+from mmsynth.field.kernels.cpu.surface import POINTS
+from mmsynth.field.kernels.parameters import GridTable, Hits, Measured, Rays, Sampling, ShadedRays, ShaderWeights, SurfaceNetwork
+
+P = TypeVar("P", bound=tuple[Any, ...])
+
+
+class TraceOutputs(NamedTuple):
+    """Of rays: as in ``Hits``, but ``samples`` of each chunk; shown: the weight by which features were divided."""
+
+    features: np.ndarray
+    opacity: np.ndarray
+    shown: np.ndarray
+    depth: np.ndarray
+    samples: np.ndarray
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _arrays(parameters: P) -> P:
+    """Tensors as arrays, numbers in single precision: the types that the kernels are compiled for."""
+    return type(parameters)(*map(_compiled, parameters))
+
+
+def _compiled(x: Any) -> Any:
+    return _array(x) if isinstance(x, Tensor) else np.float32(x) if isinstance(x, float) else x
+
+
+def _in_double(sampling: Sampling) -> Sampling:
+    """Numbers in double precision, even those given as integers."""
+    whole = {"active_surface", "active_radiance"}
+    values: dict[str, Any] = {name: value if name in whole else float(value) for name, value in sampling._asdict().items()}
+    return Sampling(**values)
+
+
+def _table_gradient(table: Tensor) -> np.ndarray:
+    if table.grad is None:
+        table.grad = torch.zeros_like(table)
+    return table.grad.numpy()
+
+
+def _kept(*tensors: Tensor) -> bool:
+    """Whether a backward pass may follow; within ``forward`` autograd does not tell."""
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+
+
+def _summed(arrays: SurfaceStore | RayStore, chunks: int) -> tuple[Tensor, Tensor]:
+    """Gradients of a network's weights."""
+    return torch.from_numpy(arrays.hidden_out[:chunks].sum(0)), torch.from_numpy(arrays.output_out[:chunks].sum(0))
+
+
+def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
+    """See ``reference.surface_value``; float32. Differentiable in positions, weights, and, in place, the table."""
+    keep = _kept(positions, network.hidden)
+    return _Value.apply(keep, positions, grid, network, network.hidden, network.output)
+
+
+class _Value(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, keep: bool, positions: Tensor, grid: GridTable, network: SurfaceNetwork, hidden: Tensor, output: Tensor
+    ) -> Tensor:
+        store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), *hidden.shape)
+        out = torch.empty(len(positions))
+        surface.surface_forward(_array(positions), _arrays(grid), _arrays(network), keep, store.arrays, out.numpy())
+        if keep:
+            ctx.store, ctx.parameters = store, (grid, network)
+            ctx.save_for_backward(hidden, output)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, output = ctx.saved_tensors
+        (grid, network), arrays, count = ctx.parameters, ctx.store.arrays, len(gradient)
+        g, table, weights = _array(gradient), _arrays(grid), _arrays(network._replace(hidden=hidden, output=output))
+        surface.surface_backward(g, grid.active, weights, arrays)
+        positions = None
+        if ctx.needs_input_grad[1]:
+            positions = torch.empty(count, 3)
+            surface.surface_positions(g, table, weights, arrays, positions.numpy())
+        if grid.table.requires_grad:
+            surface.surface_scatter(count, table, arrays, _table_gradient(grid.table))
+        ctx.store = None
+        return None, positions, None, None, *_summed(arrays, -(-count // POINTS))
+
+
+def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
+    """See ``reference.trace``; float32. Differentiable in origins, directions, weights, and, in place, the tables."""
+    keep = _kept(rays.origins, rays.directions, network.hidden)
+    parameters = grid, network, appearance, states, rays, _in_double(sampling)
+    return Hits(*_Trace.apply(keep, rays.origins, rays.directions, network.hidden, network.output, parameters))
+
+
+class _Trace(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, keep: bool, origins: Tensor, directions: Tensor, hidden: Tensor, output: Tensor, parameters: tuple[Any, ...]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        grid, network, appearance, states, rays, sampling = parameters
+        count, levels = len(origins), len(appearance.resolutions)
+        chunks = -(-count // CHUNK)
+        units, width = hidden.shape
+        store = ray_store(chunks if keep else get_num_threads(), units, width, levels)
+        features = torch.empty(count, FEATURES * levels)
+        opacity, shown, depth = torch.empty(count), torch.empty(count), torch.empty(count)
+        samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
+        marching.trace_forward(
+            _arrays(rays), _array(states), sampling, _arrays(grid), _arrays(network), _arrays(appearance), keep, store.arrays,
+            TraceOutputs(*(x.numpy() for x in (features, opacity, shown, depth, samples))),
+        )  # fmt: skip
+        if keep:
+            ctx.store, ctx.parameters = store, (grid, network, appearance, sampling.sharpness)
+            ctx.save_for_backward(hidden, output, origins, directions, features, shown)
+        ctx.mark_non_differentiable(depth, samples)
+        return features, opacity, depth, samples.sum()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, g_features: Tensor, g_opacity: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, output, origins, directions, features, shown = ctx.saved_tensors
+        (grid, network, appearance, sharpness), arrays, count = ctx.parameters, ctx.store.arrays, len(features)
+        table, look, weights = _arrays(grid), _arrays(appearance), _arrays(network._replace(hidden=hidden, output=output))
+        tracing_gradients.trace_backward(
+            count, *map(_array, (g_features, g_opacity, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
+        )
+        to_rays: list[Tensor | None] = [None, None]
+        if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
+            found = torch.empty(origins.shape), torch.empty(directions.shape)
+            tracing_gradients.trace_rays_backward(
+                _array(origins), _array(directions), table, weights, look, arrays, *(x.numpy() for x in found)
+            )
+            to_rays = list(found)
+        if grid.table.requires_grad or appearance.table.requires_grad:
+            gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
+            tracing_gradients.trace_scatter(count, table, look, arrays, *gradients)
+        ctx.store = None
+        return None, *to_rays, *_summed(arrays, -(-count // CHUNK)), None
+
+
+def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """See ``reference.compare``; float32, ``measured.ray`` never decreasing. Differentiable in features, opacity, gain and weights."""
+    gain = rays.features.new_empty(0) if gain is None else gain
+    learn = _kept(rays.features, rays.opacity, gain, *weights)
+    return _Compare.apply(learn, rays, measured, rays.features, rays.opacity, gain, *weights)
+
+
+class _Compare(torch.autograd.Function):
+    """The gradients of a measurement are known when it is: the forward pass takes them all, the backward pass only scales them."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, learn: bool, rays: ShadedRays, measured: Measured, features: Tensor, opacity: Tensor, gain: Tensor, *weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        chunks = -(-len(features) // shading.CHUNK)
+        tensors = ShaderWeights(*weights)
+        arrays = (store := shading_store(max(chunks, get_num_threads()), tensors)).arrays
+        loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
+        gradients = [torch.empty(x.shape) for x in (features, opacity, gain)]
+        shading.compare(
+            _arrays(rays), _arrays(measured), _array(gain), _arrays(tensors), learn, arrays, loss, squared.numpy(),
+            *(g.numpy() for g in gradients),
+        )  # fmt: skip
+        if learn:
+            for name, weight in zip(ShaderWeights._fields, weights, strict=True):
+                whole = getattr(arrays, f"{name}_out")[:chunks].sum(0)
+                gradients.append(torch.from_numpy(whole[tuple(slice(n) for n in weight.shape)]))
+            ctx.gradients = gradients
+        del store  # not before its arrays were read
+        ctx.mark_non_differentiable(squared)
+        return torch.tensor(loss.sum(), dtype=torch.float32), squared
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, None, *(gradient * g for g in ctx.gradients)
+
+
+def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees: Tensor | int) -> Tensor:
+    """See ``reference.shade``; fused for rays of one degree, without a gradient."""
+    if isinstance(degrees, Tensor) or torch.is_grad_enabled():
+        return reference.shade(weights, features, directions, degrees)
+    outputs = torch.empty(len(features), len(weights.heads_bias))
+    shading.shade(_array(features), _array(directions), degrees, _arrays(weights), outputs.numpy())
+    return outputs

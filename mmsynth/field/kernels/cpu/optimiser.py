@@ -1,0 +1,44 @@
+"""Adam on the CPU."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from torch import Tensor
+
+ADAM_CHUNK = 16384  # parameters at a time
+
+
+@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+def adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
+    """``rate`` includes the first bias correction, ``root`` is one over the square root of the second."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for i in range(p.shape[0]):
+        a = beta1 * m[i] + (one - beta1) * g[i]
+        b = beta2 * v[i] + (one - beta2) * g[i] * g[i]
+        m[i] = a
+        v[i] = b
+        p[i] -= rate * a / (np.float32(math.sqrt(b)) * root + epsilon)
+        g[i] = zero
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def adam_parts(p, g, m, v, rate, beta1, beta2, root, epsilon):  # type: ignore[no-untyped-def]
+    """``adam_part`` of many parameters."""
+    count = p.shape[0]
+    for chunk in prange((count + ADAM_CHUNK - 1) // ADAM_CHUNK):
+        begin = np.int64(chunk) * ADAM_CHUNK
+        end = min(count, begin + ADAM_CHUNK)
+        adam_part(p[begin:end], g[begin:end], m[begin:end], v[begin:end], rate, beta1, beta2, root, epsilon)
+
+
+def adam(
+    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, beta1: float, beta2: float, epsilon: float, count: int
+) -> None:
+    """See ``reference.adam``; float32."""
+    arrays = (x.detach().view(-1).numpy() for x in (parameter, gradient, first, second))
+    f = np.float32
+    step = adam_parts if parameter.numel() > ADAM_CHUNK else adam_part  # to wake the other threads would take longer than the work
+    step(*arrays, f(rate / (1 - beta1**count)), f(beta1), f(beta2), f(1 / math.sqrt(1 - beta2**count)), f(epsilon))  # type: ignore[call-arg]

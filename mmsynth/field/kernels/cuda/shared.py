@@ -1,0 +1,66 @@
+"""What the Triton kernels share: the compiler, constants, and whether they can run on this machine."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+
+from mmsynth.field.kernels import constants
+
+try:
+    import triton
+    import triton.language as tl
+except ImportError:
+    triton = tl = None
+
+
+def jit(function: Any) -> Any:
+    """``triton.jit`` that compiles once, not anew for sizes that happen to be 1 or multiples of 16; a no-op without triton."""
+    return function if triton is None else triton.jit(do_not_specialize=["count", "rays", "levels", "active", "k", "grid"])(function)
+
+
+def constant(value: float) -> Any:
+    """A number of ``kernels.constants`` that kernels may read."""
+    return value if tl is None else tl.constexpr(value)
+
+
+SOLID, OUTSIDE = constant(constants.SOLID), constant(constants.OUTSIDE)
+ALONG_FACE, NO_CROSSING = constant(constants.ALONG_FACE), constant(constants.NO_CROSSING)
+FACE_OVERSHOOT = constant(constants.FACE_OVERSHOOT)
+FIRST_FEATURE_ROW = constant(constants.FIRST_FEATURE_ROW)
+HASH_Y, HASH_Z = constant(constants.HASH_PRIMES[1]), constant(constants.HASH_PRIMES[2])
+
+
+@jit
+def position(positions, i, live):  # type: ignore[no-untyped-def]
+    x = tl.load(positions + 3 * i, mask=live, other=0.0)
+    y = tl.load(positions + 3 * i + 1, mask=live, other=0.0)
+    z = tl.load(positions + 3 * i + 2, mask=live, other=0.0)
+    return x, y, z
+
+
+@jit
+def _one(out):  # type: ignore[no-untyped-def]
+    tl.store(out, 1.0)
+
+
+@functools.cache
+def _probe() -> tuple[bool, str]:
+    # Triton compiles its launcher with the machine's C compiler and Python's headers: only a launch tells whether they are there
+    try:
+        out = torch.zeros(1, device="cuda")
+        _one[(1,)](out)
+        return (True, "") if out.item() == 1.0 else (False, "a triton kernel ran, but its result is wrong")
+    except Exception as error:  # whatever the compiler, the driver or torch raise: the torch operations do instead
+        return False, "no triton kernel can be run: " + (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def available() -> tuple[bool, str]:
+    """Whether the operations can run on this machine's GPU; if not, why: one line."""
+    if triton is None:
+        return False, "triton is not installed"
+    if not torch.cuda.is_available():
+        return False, "torch sees no CUDA device"
+    return _probe()

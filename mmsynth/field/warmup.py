@@ -1,0 +1,52 @@
+"""Kernels compiled or loaded before the clock starts."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+
+import torch
+
+from mmsynth.field import kernels
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.kernels import cpu
+from mmsynth.field.kernels.cpu.optimiser import ADAM_CHUNK
+from mmsynth.field.occupancy import Occupancy
+from mmsynth.field.radiance import Shader
+from mmsynth.field.rendering import trace
+from mmsynth.field.surface import Surface
+from mmsynth.scene.scene import Sensor
+
+
+@functools.cache
+def warm_up() -> None:
+    """Compile the CPU kernels of a fit if they never were, and say so, and load them, so that no timed loop does it.
+
+    A process of its own compiles: in the one that did, kernels share code that was compiled for others, and its sums are rounded otherwise
+    than in every later process, which loads the kernels from the cache. Where there is no cache, this process has to compile.
+    """
+    if not cpu.is_compiled():
+        print("compiling kernels once, ~35 s ...", file=sys.stderr, flush=True)
+        command = [sys.executable, "-c", "from mmsynth.field.warmup import run_kernels; run_kernels()"]
+        subprocess.run(command, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True)
+    run_kernels()
+
+
+def run_kernels() -> None:
+    """Call each kernel of a fit: a tiny fit."""
+    with torch.random.fork_rng(devices=[]), torch.enable_grad():
+        surface, appearance = Surface(HashGrid(1, 8, 4, 4), 4, (0.5, 4.0)), HashGrid(1, 8, 4, 4)
+        origins, directions = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True), torch.tensor([[0.0, 0.0, 1.0]])
+        hits = trace(surface, appearance, Occupancy(4), origins, directions, torch.zeros(1), kernels.Sampling(20.0, 0.1, 1, 1))
+        weights = Shader(4, 4, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}).weights()
+        one, index = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+        rays = kernels.ShadedRays(hits.features, hits.opacity, directions, index, index == 0)
+        loss, _ = kernels.compare(weights, rays, kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one))
+        (loss + surface(origins.detach(), 1).sum()).backward()
+    with torch.no_grad():
+        kernels.shade(weights, hits.features, directions, 0)
+    for count in (1, ADAM_CHUNK + 1):
+        parameter, gradient, first, second = torch.zeros(4, count)
+        kernels.adam(parameter, gradient, first, second, 1e-3, 0.9, 0.99, 1e-15, 1)
