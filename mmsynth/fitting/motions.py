@@ -78,11 +78,6 @@ class NormalEquations:
     def both(self) -> NormalEquations:
         return NormalEquations(self.matrix.sum(0), self.vector.sum(0), self.error.sum(0), self.weight.sum(0))
 
-    @property
-    def variance(self) -> float:
-        """Of a residual."""
-        return float(self.error.sum() / self.weight.sum())
-
 
 @dataclass(frozen=True)
 class RayJacobian:
@@ -172,20 +167,18 @@ def solve(equations: NormalEquations, layout: Layout, motions: Motions, views: b
     now = moved(layout, motions)
     here = _adjoint(now, now[layout.anchor][layout.view])
     back = np.swapaxes(here, 1, 2)
-    precision = equations.variance / prior**2
+    precision = float(equations.error.sum() / equations.weight.sum()) / prior**2
     own = precision * np.eye(6)
-    to_view, to_sensor = np.zeros_like(motions.views), np.zeros_like(motions.sensors)
-    free = np.flatnonzero(layout.free)
+    to_sensor = np.zeros_like(motions.sensors)
+    free = np.flatnonzero(layout.free & rig)
     # of the views: block diagonal; of the sensors, after the views are eliminated: small and dense
     matrix_v = _grouped(back @ equations.matrix @ here, layout.view, len(layout.views)) + own
     vector_v = _grouped(_times(back, equations.vector), layout.view, len(layout.views)) + precision * motions.views
     matrix_s = _grouped(equations.matrix, layout.sensor, len(layout.sensors)) + own
     vector_s = _grouped(equations.vector, layout.sensor, len(layout.sensors)) + precision * motions.sensors
-    if not rig:
-        return Motions(-_solved(matrix_v, vector_v), to_sensor)
     if not views:
         to_sensor[free] = -_solved(matrix_s[free], vector_s[free])
-        return Motions(to_view, to_sensor)
+        return Motions(np.zeros_like(motions.views), to_sensor)
     pairs = np.zeros((len(layout.views), len(layout.sensors), 6, 6))
     np.add.at(pairs, (layout.view, layout.sensor), back @ equations.matrix)
     cross = pairs[:, free].swapaxes(1, 2).reshape(len(layout.views), 6, 6 * len(free))
@@ -278,10 +271,7 @@ def _adjoint(to: np.ndarray, of: np.ndarray) -> np.ndarray:
 
 def _cross(v: np.ndarray) -> np.ndarray:
     """(..., 3) → (..., 3, 3), the matrix of w → v × w."""
-    out = np.zeros((*v.shape, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., i, j], out[..., j, i] = -v[..., k], v[..., k]
-    return out
+    return np.cross(np.eye(3), v[..., None, :])
 
 
 def _grouped(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from mmsynth.field.field import Design
-from mmsynth.fitting.choices import Choice, summary, switch
+from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
@@ -52,13 +52,6 @@ class Needs:
     def with_choices(self, more: Mapping[str, Choice[Any]]) -> Needs:
         """With what was decided since."""
         return replace(self, choices={**self.choices, **more})
-
-    def summary(self, verbose: bool = False) -> list[str]:
-        """One line for each choice that changed something; ``verbose``: for all of them."""
-        return summary(self.choices, verbose)
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

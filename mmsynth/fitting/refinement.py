@@ -174,25 +174,17 @@ class Refinement:
 
     def sizes(self) -> dict[str, dict[str, dict[str, float]]]:
         """How far each view (by id) and sensor (by name) was moved: degrees, length (scene unit), pixels (of the region's picture)."""
-        layout = self.layout
-        metric = {
-            "views": layout.pixels[layout.anchor],
-            "sensors": np.array([layout.pixels[layout.sensor == s].mean(0) for s in range(len(layout.sensors))]),
-        }
-        names = {"views": layout.views, "sensors": layout.sensors}
-        motions = {"views": self.motions.views, "sensors": self.motions.sensors}
-        return {
-            kind: {
-                str(name): {
-                    "degrees": float(np.degrees(np.linalg.norm(m[:3]))),
-                    "length": float(np.linalg.norm(m[3:]) * self.region.radius),
-                    "pixels": float(np.sqrt(m @ metric[kind][i] @ m)),
-                }
-                for i, (name, m) in enumerate(zip(names[kind], motions[kind], strict=True))
-                if m.any()
-            }
-            for kind in ("views", "sensors")
-        }
+        layout, motions = self.layout, self.motions
+
+        def size(motion: np.ndarray, metric: np.ndarray) -> dict[str, float]:
+            degrees, length = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:]) * self.region.radius
+            return {"degrees": float(degrees), "length": float(length), "pixels": float(np.sqrt(motion @ metric @ motion))}
+
+        views = zip(layout.views, motions.views, layout.pixels[layout.anchor], strict=True)
+        sensors = (
+            (n, m, layout.pixels[layout.sensor == s].mean(0)) for s, (n, m) in enumerate(zip(layout.sensors, motions.sensors, strict=True))
+        )
+        return {kind: {str(n): size(m, p) for n, m, p in named if m.any()} for kind, named in (("views", views), ("sensors", sensors))}
 
     def state_dict(self) -> dict[str, Any]:
         return {
