@@ -49,22 +49,25 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: the file is missing, unreadable or not JSON (with line and column).
-    """
+def read_text(path: Path) -> str:
+    """Read a UTF-8 file; InputError where it is missing, unreadable or something else."""
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not valid JSON at line {error.lineno}, column {error.colno} ({error.msg}).") from error
+        return Path(path).read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text at byte {error.start}.") from error
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits, lists in lists without end
-        raise InputError(f"{path}: JSON that cannot be read ({str(error).split(';')[0].split(': ')[0]}).") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; InputError as ``read_text``, or where it is not JSON (with line and column)."""
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: not valid JSON at line {error.lineno}, column {error.colno} ({error.msg}).") from error
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, lists in lists without end
+        raise InputError(f"{path}: JSON that cannot be read ({str(error).split(';')[0].split(': ')[0]}).") from error
 
 
 def sha256_of(path: Path) -> str:

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.files import read_text
 from mmsynth.sensors.camera import Camera, Lens
 
 
@@ -24,9 +25,11 @@ def is_number(value: Any) -> TypeGuard[float]:
         return False
 
 
-def number(entry: Mapping[str, Any], key: str, where: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """``entry[key]`` as a finite float; from ``low`` to ``high``."""
-    value = entry.get(key)
+def number(
+    entry: Mapping[str, Any], key: str, where: str, low: float = -math.inf, high: float = math.inf, default: float | None = None
+) -> float:
+    """``entry[key]`` as a finite float, from ``low`` to ``high``; the default, if there is one, where the key is missing."""
+    value = entry.get(key, default)
     if not is_number(value) or not low <= value <= high:
         expected = "a finite number" if math.isinf(low) else f"a number from {low:g} to {high:g}"
         raise InputError(f"{where}: key '{key}' is {'missing' if key not in entry else repr(value)}, expected {expected}.")
@@ -100,31 +103,21 @@ def rigid_pose(matrix: Any, where: str, tolerance: float = 1e-4) -> np.ndarray:
 
 
 def make_camera(
-    where: str,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    distortion: Sequence[float] = (),
-    lens: Lens = "brown_conrady",
+    where: str, size: tuple[int, int], intrinsics: Sequence[float], distortion: Sequence[float] = (), lens: Lens = "brown_conrady"
 ) -> Camera:
-    """A Camera whose errors name the file; no coefficients when all are zero, so that equal cameras compare equal."""
+    """A Camera of width, height and fx, fy, cx, cy; no coefficients when all are zero, so that equal cameras compare equal."""
+    fx, fy, cx, cy = intrinsics
     try:
-        return Camera(width, height, fx, fy, cx, cy, tuple(distortion) if any(distortion) else (), lens)
+        return Camera(*size, fx, fy, cx, cy, tuple(distortion) if any(distortion) else (), lens)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 
 
-def text_lines(path: Path) -> list[str]:
-    """The lines of a UTF-8 file, without their ends."""
-    try:
-        return path.read_text(encoding="utf-8").split("\n")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text at byte {error.start}.") from error
-    except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
+def text_lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The place and the words of every line of a UTF-8 file that is no comment (#); no words of an empty one."""
+    for row, line in enumerate(read_text(path).split("\n"), 1):
+        if not line.lstrip().startswith("#"):
+            yield f"{path}: line {row}", line.split()
 
 
 def floats(tokens: Sequence[str], where: str, line: str) -> np.ndarray:
@@ -140,12 +133,9 @@ def floats(tokens: Sequence[str], where: str, line: str) -> np.ndarray:
 
 def rotation_of(quaternion: np.ndarray, where: str) -> np.ndarray:
     """Quaternion (w, x, y, z), of unit length but for the rounding of its decimals → (3, 3) rotation."""
+    from scipy.spatial.transform import Rotation  # a second to import
+
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-3:
         raise InputError(f"{where}: the quaternion has the length {norm:.4g}, expected a unit quaternion.")
-    w, x, y, z = quaternion / norm
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    return np.asarray(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())

@@ -1,12 +1,10 @@
-"""Arrays to image files, each written atomically.
-
-Every writer raises InputError where the disk refuses.
-"""
+"""Arrays to image files, each written atomically. Every writer raises InputError where the disk refuses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,20 +23,12 @@ def to_uint16(image: np.ndarray) -> np.ndarray:
 
 
 def write_png16(path: Path, image: np.ndarray) -> None:
-    """Write (H, W), (H, W, 1) or RGB (H, W, 3) values in [0, 1] as 16-bit PNG; see ``to_uint16`` for the rounding.
-
-    Raises:
-        InputError: not 1 or 3 channels, or the disk refused.
-    """
+    """Write (H, W), (H, W, 1) or RGB (H, W, 3) values in [0, 1] as 16-bit PNG, see ``to_uint16`` and ``write_png``."""
     write_png(path, to_uint16(image))
 
 
 def write_png(path: Path, numbers: np.ndarray) -> None:
-    """Write uint8 or uint16 numbers (H, W), (H, W, 1) or RGB (H, W, 3) as they are.
-
-    Raises:
-        InputError: not 1 or 3 channels, or the disk refused.
-    """
+    """Write uint8 or uint16 numbers (H, W), (H, W, 1) or RGB (H, W, 3) as they are; InputError for other channels."""
     if numbers.ndim == 3 and numbers.shape[2] == 3:
         numbers = cv2.cvtColor(numbers, cv2.COLOR_RGB2BGR)
     elif numbers.ndim != 2 and not (numbers.ndim == 3 and numbers.shape[2] == 1):
@@ -51,13 +41,8 @@ def write_png(path: Path, numbers: np.ndarray) -> None:
 def write_tiff(path: Path, numbers: np.ndarray) -> None:
     """Write numbers (H, W) or (H, W, C) as they are (zlib, any channel count)."""
     photometric = "rgb" if numbers.ndim == 3 and numbers.shape[2] == 3 else "minisblack"
-    planar = "contig" if numbers.ndim == 3 else None
-    write_atomic(
-        Path(path),
-        lambda temporary: tifffile.imwrite(
-            temporary, numbers, photometric=photometric, planarconfig=planar, compression="zlib", metadata=None
-        ),
-    )
+    options: dict[str, Any] = {"planarconfig": "contig" if numbers.ndim == 3 else None, "compression": "zlib", "metadata": None}
+    write_atomic(Path(path), lambda temporary: tifffile.imwrite(temporary, numbers, photometric=photometric, **options))
 
 
 # XYZ to linear sRGB (IEC 61966-2-1), for a camera whose colours nobody measured
@@ -84,12 +69,8 @@ def write_dng(path: Path, numbers: np.ndarray, pattern: np.ndarray, black: int, 
         (50728, "2I", 3, rational((1.0, 1.0, 1.0)), True),  # AsShotNeutral
         (50778, "H", 1, 21, True),  # CalibrationIlluminant1: D65
     ]
-    write_atomic(
-        Path(path),
-        lambda temporary: tifffile.imwrite(
-            temporary, numbers, photometric="cfa", compression=None, metadata=None, software="mmsynth", extratags=extra
-        ),
-    )
+    options: dict[str, Any] = {"compression": None, "metadata": None, "software": "mmsynth", "extratags": extra}
+    write_atomic(Path(path), lambda temporary: tifffile.imwrite(temporary, numbers, photometric="cfa", **options))
 
 
 def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str] | None = None) -> None:

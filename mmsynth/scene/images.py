@@ -59,17 +59,9 @@ def read_native(path: Path) -> np.ndarray:
         raise InputError(f"{path}: unknown image type '{path.suffix}', expected one of {' '.join(SUFFIXES)}.")
     if not path.is_file():
         raise InputError(f"{path}: no such image file.")
+    readers = {".tif": _read_tiff, ".tiff": _read_tiff, ".dng": _read_dng, ".exr": _read_exr, ".npy": _read_numpy, ".npz": _read_numpy}
     try:
-        if suffix in (".png", ".jpg", ".jpeg"):
-            image = _read_photo(path)
-        elif suffix in (".tif", ".tiff"):
-            image = _read_tiff(path)
-        elif suffix == ".dng":
-            image = _read_dng(path)
-        elif suffix == ".exr":
-            image = _read_exr(path)
-        else:
-            image = _read_numpy(path)
+        image = readers.get(suffix, _read_photo)(path)
     except InputError:
         raise
     except Exception as error:  # each library has its own zoo of exceptions for a damaged file
@@ -158,9 +150,8 @@ def saturation_level(raw: np.ndarray) -> float:
     if raw.dtype.kind == "f":
         return float("inf")
     bits = raw.dtype.itemsize * 8
-    empty = bits - used_bits(raw)
-    top = (1 << bits) - (1 << empty)
-    return 0.998 * top / ((1 << bits) - 1)
+    top = 2**bits - 2 ** (bits - used_bits(raw))
+    return 0.998 * top / (2**bits - 1)
 
 
 def _read_photo(path: Path) -> np.ndarray:
@@ -169,11 +160,9 @@ def _read_photo(path: Path) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(f"{path}: damaged image, could not be decoded.")
-    if image.ndim == 3 and image.shape[2] == 3:
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-    if image.ndim == 3 and image.shape[2] == 4:
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA))
-    return np.asarray(image)
+    if image.ndim == 2:
+        return np.asarray(image)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 
 def _read_tiff(path: Path) -> np.ndarray:
@@ -207,19 +196,15 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         InputError: missing or damaged.
     """
     try:
-        return _exr_channels(path)
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings there, and --json promises nothing else
+            file = OpenEXR.File(str(path), separate_channels=True)
+        return {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:
         raise InputError(f"{path}: damaged or truncated image, could not be read ({first_line(error)}).") from error
 
 
-def _exr_channels(path: Path) -> dict[str, np.ndarray]:
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings there, and --json promises nothing else
-        file = OpenEXR.File(str(path), separate_channels=True)
-    return {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
-
-
 def _read_exr(path: Path) -> np.ndarray:
-    channels = _exr_channels(path)
+    channels = read_exr(path)
     if any(name.startswith("S0.") and name.endswith("nm") for name in channels):
         channels = {name: pixels for name, pixels in channels.items() if name not in ("R", "G", "B", "A")}  # a preview of the spectrum
     colour = [name for name in ("R", "G", "B", "A") if name in channels]

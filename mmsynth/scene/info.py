@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.scene.images import check_file, load_frame, read_native, used_bits
 from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.scene.serialisation import sensor_to_json
 from mmsynth.sensors.camera import Camera, round_trip_error
+
+T = TypeVar("T")
 
 
 def describe_scene(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
@@ -52,15 +56,19 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
         "masks": sum(frame.mask is not None for frame in frames),
         "size": [camera.width, camera.height],
         "cameras": len({frame.camera for frame in frames}),
-        "channels": list(sensor.channels),
-        "wavelengths_nm": list(sensor.wavelengths_nm),
-        "mosaic": None if sensor.mosaic is None else sensor.mosaic.tolist(),
-        "polarizer_angles_deg": None if sensor.polarizer_angles_deg is None else list(sensor.polarizer_angles_deg),
-        "saturation": sensor.saturation if math.isfinite(sensor.saturation) else None,
+        **{key: value for key, value in sensor_to_json(sensor).items() if key != "name"},
         **_lens(camera),
     }
-    problems += _damaged(frames)
-    out |= _file_type(frames, problems) | _statistics(sensor, frames, measured_frames, problems)
+    for frame in frames:
+        for path in (frame.path, frame.mask):
+            if path is not None:
+                _tried(problems, check_file, path)
+    raw = _tried(problems, read_native, frames[0].path)
+    if raw is None:
+        out |= {"file_type": None, "bits": None}
+    else:
+        out |= {"file_type": str(raw.dtype), "bits": used_bits(raw) if raw.dtype.kind == "u" else raw.dtype.itemsize * 8}
+    out |= _statistics(sensor, frames, measured_frames, problems)
     if out["file_type"] == "uint16" and out["max"] is not None and out["max"] <= 4095 / 65535:
         problems.append(f"{sensor.name}: no value exceeds {out['max']:.3f} of full scale, as in 12-bit data that is not left-aligned.")
     return out
@@ -78,37 +86,15 @@ def _lens(camera: Camera, most: int = 250_000) -> dict[str, Any]:
     }
 
 
-def _damaged(frames: tuple[Frame, ...]) -> list[str]:
-    found = []
-    for frame in frames:
-        for path in (frame.path, frame.mask):
-            try:
-                if path is not None:
-                    check_file(path)
-            except InputError as error:
-                found.append(str(error))
-    return found
-
-
-def _file_type(frames: tuple[Frame, ...], problems: list[str]) -> dict[str, Any]:
-    try:
-        raw = read_native(frames[0].path)
-    except InputError as error:
-        _add(problems, error)
-        return {"file_type": None, "bits": None}
-    return {"file_type": str(raw.dtype), "bits": used_bits(raw) if raw.dtype.kind == "u" else raw.dtype.itemsize * 8}
-
-
 def _statistics(sensor: Sensor, frames: tuple[Frame, ...], most: int, problems: list[str]) -> dict[str, Any]:
     chosen = sorted({round(index) for index in np.linspace(0, len(frames) - 1, min(most, len(frames)))})
     count, total, saturated, low, high = 0, 0.0, 0, math.inf, -math.inf
     measured = 0
     for index in chosen:
-        try:
-            pixels, _ = load_frame(sensor, frames[index])
-        except InputError as error:
-            _add(problems, error)
+        loaded = _tried(problems, load_frame, sensor, frames[index])
+        if loaded is None:
             continue
+        pixels = loaded[0]
         measured += 1
         count += pixels.size
         total += float(pixels.sum(dtype=np.float64))
@@ -125,24 +111,29 @@ def _statistics(sensor: Sensor, frames: tuple[Frame, ...], most: int, problems: 
     }
 
 
-def _add(problems: list[str], error: InputError) -> None:
-    """A damaged file is found by the check and again by reading it: one sentence per file is enough."""
-    text = str(error)
-    if not any(problem.split(": ")[0] == text.split(": ")[0] for problem in problems):
-        problems.append(text)
+def _tried(problems: list[str], read: Callable[..., T], *what: Any) -> T | None:
+    """What a reader gives. A damaged file is found by the check and again by reading it: one sentence per file is enough."""
+    try:
+        return read(*what)
+    except InputError as error:
+        text = str(error)
+        if not any(problem.split(": ")[0] == text.split(": ")[0] for problem in problems):
+            problems.append(text)
+        return None
 
 
-# --- text ------------------------------------------------------------------------------------------------------------
+# --- text
 
 
 def render_text(description: dict[str, Any]) -> str:
     """The dictionary of ``describe_scene`` as plain text, some lines per sensor."""
     region, split = description["region"], description["split"]
+    test = [*map(str, split["test"][:12]), *(["..."] if len(split["test"]) > 12 else [])]
     lines = [
         f"{description['scene']}  ({description['format']})",
         f"region   ball around ({', '.join(f'{value:.4g}' for value in region['centre'])}), "
         f"radius {region['radius']:.4g} {description['unit']}" + (", black background" if description["black_background"] else ""),
-        f"views    {len(split['train'])} train, {len(split['test'])} test: {_ids(split['test'])} ({split['source']})",
+        f"views    {len(split['train'])} train, {len(split['test'])} test: {', '.join(test)} ({split['source']})",
     ]
     for name, sensor in description["sensors"].items():
         lines += ["", *_sensor_lines(name, sensor)]
@@ -154,10 +145,11 @@ def render_text(description: dict[str, Any]) -> str:
 def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
     width, height = sensor["size"]
     masks = f", {sensor['masks']} with a mask" if sensor["masks"] else ""
+    pattern = " / ".join(" ".join(map(str, row)) for row in sensor["mosaic"] or ())
     lines = [
         f"{name}",
         f"  frames    {sensor['frames']} ({sensor['train']} train, {sensor['test']} test{masks}), {width}x{height} pixels",
-        f"  channels  {' '.join(sensor['channels'])}" + _pattern(sensor["mosaic"]),
+        f"  channels  {' '.join(sensor['channels'])}" + (f", mosaic {pattern}" if pattern else ""),
     ]
     if sensor["polarizer_angles_deg"] is not None:
         lines.append(
@@ -179,11 +171,3 @@ def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
     lost = f"; {sensor['invalid_lens_pixels']} pixels ({share:.2f} %) have no ray and are not used" if share else ""
     lines.append(f"  lens      {sensor['lens']}, {back}{lost}")
     return lines
-
-
-def _pattern(mosaic: list[list[int]] | None) -> str:
-    return "" if mosaic is None else ", mosaic " + " / ".join(" ".join(map(str, row)) for row in mosaic)
-
-
-def _ids(views: list[int], most: int = 12) -> str:
-    return ", ".join(map(str, views[:most])) + (", ..." if len(views) > most else "")

@@ -11,6 +11,7 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.scene.images import saturation_level
 from mmsynth.scene.scene import Sensor, canonical_modality
+from mmsynth.sensors.mosaic import pattern_of
 
 _MS_NM = (692.0, 653.0, 611.0, 572.0, 541.0, 503.0, 464.0, 431.0, None)
 
@@ -69,7 +70,8 @@ def make_sensor(name: str, entry: Mapping[str, Any], where: str, image: np.ndarr
             count = expected or count - 1
     labels = entry.get("channels")
     if labels is None:
-        labels = known["channels"] if len(known.get("channels", ())) == count else _plain_labels(name, count)
+        plain = {1: (name,), 3: ("R", "G", "B")}.get(count, tuple(map(str, range(count))))
+        labels = known["channels"] if len(known.get("channels", ())) == count else plain
     same = tuple(labels) == known.get("channels")
     wavelengths = entry.get("wavelengths_nm") or (known.get("wavelengths") if same else None) or (None,) * count
     angles = entry.get("polarizer_angles_deg") or (known.get("angles") if same else None)
@@ -88,18 +90,8 @@ def make_sensor(name: str, entry: Mapping[str, Any], where: str, image: np.ndarr
     )
 
 
-def _plain_labels(name: str, count: int) -> tuple[str, ...]:
-    return (name,) if count == 1 else ("R", "G", "B") if count == 3 else tuple(str(index) for index in range(count))
-
-
 def _pattern(given: Any, where: str) -> np.ndarray:
     try:
-        pattern = np.asarray(given)
-    except ValueError:
-        pattern = np.empty(0)
-    if pattern.ndim != 2 or pattern.size == 0 or pattern.dtype.kind not in "iu":
-        raise InputError(f"{where}: key 'mosaick_pattern' is {given}, expected a matrix of channel numbers.")
-    present = np.unique(pattern)
-    if not np.array_equal(present, np.arange(len(present))):
-        raise InputError(f"{where}: key 'mosaick_pattern' holds the channels {present.tolist()}, expected 0 to {len(present) - 1}.")
-    return pattern.astype(np.int64)
+        return pattern_of(given)
+    except ValueError as error:
+        raise InputError(f"{where}: key 'mosaick_pattern' is {given}: {error}.") from error

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mmsynth.scene.scene import Region
+from mmsynth.scene.scene import Region, ball
 from mmsynth.sensors.camera import Camera
 
 
@@ -46,8 +46,8 @@ def region_from_cameras(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) 
     length = float(np.linalg.norm(direction))
     if length < 0.5:
         # cameras that face each other along one line, or a panorama
-        return _filling(mean, centres, half_view) if _before(mean, centres, axes) else Region(_triple(mean), reach)
-    return Region(_triple(mean + reach * direction / length), reach * float(np.sin(np.median(half_view))))
+        return _filling(mean, centres, half_view) if _before(mean, centres, axes) else ball(mean, reach)
+    return ball(mean + reach * direction / length, reach * float(np.sin(np.median(half_view))))
 
 
 def _before(point: np.ndarray, centres: np.ndarray, axes: np.ndarray) -> bool:
@@ -59,7 +59,7 @@ def _filling(point: np.ndarray, centres: np.ndarray, half_view: np.ndarray) -> R
     """The ball around a point that just fills the frame of a typical camera, and leaves the cameras outside."""
     distance = np.linalg.norm(centres - point, axis=1)
     radius = min(float(np.median(distance * np.sin(half_view))), 0.9 * max(float(distance.min()), float(np.median(distance)) / 9))
-    return Region(_triple(point), radius)
+    return ball(point, radius)
 
 
 def region_from_points(points: np.ndarray, seen: Region, positions: np.ndarray) -> Region:
@@ -82,13 +82,9 @@ def region_from_points(points: np.ndarray, seen: Region, positions: np.ndarray) 
     outside = positions[np.linalg.norm(positions - centre, axis=1) > seen.radius]
     room = 0.9 * float(np.linalg.norm(outside - middle, axis=1).min()) if len(outside) else reach
     radius = min(reach, seen.radius, room)
-    return Region(_triple(middle), radius) if radius > 0 else seen
+    return ball(middle, radius) if radius > 0 else seen
 
 
 def _half_view(camera: Camera) -> float:
     """Half the larger field of view, in radians."""
     return float(np.arctan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
-
-
-def _triple(point: np.ndarray) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])

@@ -11,7 +11,7 @@ Conventions (every reader converts to these, every writer from these):
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -123,6 +123,12 @@ class Region:
     radius: float
 
 
+def ball(centre: np.ndarray, radius: float) -> Region:
+    """The region around a point (3,)."""
+    x, y, z = map(float, centre)
+    return Region((x, y, z), radius)
+
+
 @dataclass(frozen=True)
 class Split:
     """View ids to train on and to test on; disjoint."""
@@ -171,7 +177,7 @@ class Scene:
     split: Split
     unit: str = "input unit"
     black_background: bool | None = None
-    problems: tuple[str, ...] = field(default=())
+    problems: tuple[str, ...] = ()
 
     def frames_of(self, sensor: str, views: tuple[int, ...] | None = None) -> tuple[Frame, ...]:
         """Frames of one sensor, optionally of some views only, in view order."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -26,22 +27,12 @@ CONVENTIONS = {
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """Intrinsics [px] and lens."""
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "lens": camera.lens,
-        "distortion": list(camera.distortion),
-    }
+    return asdict(camera) | {"distortion": list(camera.distortion)}
 
 
 def camera_from_json(stated: Mapping[str, Any]) -> Camera:
     """What ``camera_to_json`` wrote; keys beside its own are passed over."""
-    lens: dict[str, Any] = {"distortion": tuple(stated["distortion"]), "lens": stated["lens"]}
-    return Camera(**{key: stated[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}, **lens)
+    return Camera(**{f.name: stated[f.name] for f in fields(Camera)} | {"distortion": tuple(stated["distortion"])})
 
 
 def posed_to_json(posed: PosedCamera) -> dict[str, Any]:

@@ -49,12 +49,10 @@ class Camera:
     def __post_init__(self) -> None:
         if self.lens not in COEFFICIENTS:
             raise InputError(f"camera: lens {self.lens!r}, expected one of {', '.join(COEFFICIENTS)}.")
-        if self.lens == "kannala_brandt" and len(self.distortion) not in (0, 4):
-            raise InputError(f"distortion: {len(self.distortion)} coefficients, expected 4 of a fisheye: k1 k2 k3 k4.")
-        if self.lens == "brown_conrady" and len(self.distortion) not in (0, 4, 5, 6, 8):
-            raise InputError(
-                f"distortion: {len(self.distortion)} coefficients, expected 0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6."
-            )
+        fisheye, count = self.lens == "kannala_brandt", len(self.distortion)
+        if count not in ((0, 4) if fisheye else (0, 4, 5, 6, 8)):
+            expected = "4 of a fisheye: k1 k2 k3 k4" if fisheye else "0, 4, 5, 6 or 8 in the order k1 k2 p1 p2 k3 k4 k5 k6"
+            raise InputError(f"distortion: {count} coefficients, expected {expected}.")
         if not (1 <= self.width <= MAX_SIZE and 1 <= self.height <= MAX_SIZE):
             raise InputError(f"camera: size {self.width}x{self.height}, expected at least 1x1 pixel, at most {MAX_SIZE} a side.")
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)

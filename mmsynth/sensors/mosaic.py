@@ -6,6 +6,8 @@ A pattern is an integer matrix with ``channel = pattern[row % h][column % w]``, 
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
@@ -17,6 +19,24 @@ BAYER = {  # channels 0, 1, 2 = red, green, blue, and OpenCV's name of the patte
     ((1, 0), (2, 1)): cv2.COLOR_BayerGB2RGB_EA,
     ((1, 2), (0, 1)): cv2.COLOR_BayerGR2RGB_EA,
 }
+
+
+def pattern_of(given: Any) -> np.ndarray:
+    """A pattern (h, w) int64 from nested lists.
+
+    Raises:
+        ValueError: how it is wrong; not a matrix, or channels left out.
+    """
+    try:
+        pattern = np.asarray(given)
+    except ValueError:
+        pattern = np.empty(0)
+    if pattern.ndim != 2 or pattern.size == 0 or pattern.dtype.kind not in "iu":
+        raise ValueError("expected rows of one length, a matrix of channel numbers")
+    present = np.unique(pattern)
+    if not np.array_equal(present, np.arange(len(present))):
+        raise ValueError(f"holds the channels {present.tolist()}, expected 0 to {len(present) - 1}")
+    return pattern.astype(np.int64)
 
 
 def crop_pattern(pattern: np.ndarray, offset: tuple[int, int]) -> np.ndarray:

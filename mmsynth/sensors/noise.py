@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
@@ -52,12 +52,10 @@ class NoiseModel:
     def __post_init__(self) -> None:
         if not 1 <= self.bits <= 16:
             raise InputError(f"noise: bits is {self.bits}, expected 1 to 16.")
-        for name in ("gain_dn_e", "full_well_e"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise InputError(f"noise: {name} is {getattr(self, name)}, expected a positive number.")
-        for name in ("read_e", "black_dn", "dark_e_s", "exposure_s", "row_e", "dsnu_e", "prnu", "crosstalk"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"noise: {name} is {getattr(self, name)}, expected a number of at least 0.")
+        for name, value in asdict(self).items():
+            positive = name in ("gain_dn_e", "full_well_e")
+            if not (0 < value < float("inf") or (value == 0 and not positive)):
+                raise InputError(f"noise: {name} is {value}, expected a {'positive number' if positive else 'number of at least 0'}.")
         if self.crosstalk > 0.2:
             raise InputError(f"noise: crosstalk is {self.crosstalk}, expected at most 0.2: a pixel keeps as much as each neighbour gets.")
         if not self.black_dn < self.white_dn:

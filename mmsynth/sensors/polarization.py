@@ -23,6 +23,8 @@ import torch
 from torch import Tensor
 
 OffAxis = Literal["ideal", "lens", "korger"]
+Figures = Sequence[float] | Tensor | float
+"""One for each analyser, or one of them all."""
 
 
 # --- analysers
@@ -89,37 +91,27 @@ def _carried(vector: Tensor, from_axis: Tensor, to_axis: Tensor) -> Tensor:
     return vector - share * (from_axis + to_axis)
 
 
-def analyser_matrix(
-    angles_deg: Sequence[float], throughput: Sequence[float] | float = 1.0, extinction_ratio: Sequence[float] | float = math.inf
-) -> Tensor:
-    """(K, 3) float64: the intensities behind K analysers are this times a Stokes vector.
+def analyser_matrix(angles_deg: Figures, throughput: Figures = 1.0, extinction_ratio: Figures = math.inf) -> Tensor:
+    """(K, 3) float64, or (..., 3): the intensities behind K analysers are this times a Stokes vector.
 
     I = t / 2 (S0 + D (S1 cos 2θ + S2 sin 2θ)), D = (ER - 1) / (ER + 1): an analyser with extinction ratio ER passes 1 / ER of the light
     that it should absorb, of all that it passes together t.
     """
-    theta = 2.0 * torch.deg2rad(torch.tensor(angles_deg, dtype=torch.float64))
-    ratio = torch.as_tensor(extinction_ratio, dtype=torch.float64).expand(len(theta))
+    angles, passed, ratio = (torch.as_tensor(x, dtype=torch.float64) for x in (angles_deg, throughput, extinction_ratio))
+    theta = 2.0 * torch.deg2rad(angles)
     contrast = 1.0 - 2.0 / (ratio + 1.0)  # finite for ER = inf, too
-    passed = torch.as_tensor(throughput, dtype=torch.float64).expand(len(theta))
-    rows = torch.stack([torch.ones_like(theta), contrast * torch.cos(theta), contrast * torch.sin(theta)], -1)
-    return 0.5 * passed[:, None] * rows
+    return 0.5 * passed[..., None] * torch.stack([torch.ones_like(theta), contrast * torch.cos(theta), contrast * torch.sin(theta)], -1)
 
 
 def stokes_to_intensities(
-    stokes: Tensor,
-    angles_deg: Sequence[float],
-    throughput: Sequence[float] | float = 1.0,
-    extinction_ratio: Sequence[float] | float = math.inf,
+    stokes: Tensor, angles_deg: Sequence[float], throughput: Figures = 1.0, extinction_ratio: Figures = math.inf
 ) -> Tensor:
     """(..., 3) Stokes S0, S1, S2 → (..., K) intensities behind analysers (see ``analyser_matrix``)."""
     return stokes @ analyser_matrix(angles_deg, throughput, extinction_ratio).to(stokes).T
 
 
 def intensities_to_stokes(
-    intensities: Tensor,
-    angles_deg: Sequence[float],
-    throughput: Sequence[float] | float = 1.0,
-    extinction_ratio: Sequence[float] | float = math.inf,
+    intensities: Tensor, angles_deg: Sequence[float], throughput: Figures = 1.0, extinction_ratio: Figures = math.inf
 ) -> Tensor:
     """(..., K) intensities → (..., 3) Stokes vectors, least squares over the K analysers (K ≥ 3 distinct angles)."""
     return intensities @ torch.linalg.pinv(analyser_matrix(angles_deg, throughput, extinction_ratio)).to(intensities).T

@@ -17,9 +17,9 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from mmsynth.errors import InputError
-from mmsynth.files import write_text
 from mmsynth.packaged import data_folder
 from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.mosaic import pattern_of
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.polarization import OffAxis
 from mmsynth.toml import read_toml
@@ -132,13 +132,8 @@ class SensorFile(_Strict):
     @field_validator("mosaic")
     @classmethod
     def _channels_without_holes(cls, mosaic: tuple[tuple[int, ...], ...] | None) -> tuple[tuple[int, ...], ...] | None:
-        if mosaic is None:
-            return None
-        if not mosaic or len({len(row) for row in mosaic}) != 1 or not mosaic[0]:
-            raise ValueError("expected rows of one length")
-        found = sorted({c for row in mosaic for c in row})
-        if found != list(range(len(found))):
-            raise ValueError(f"holds the channels {found}, expected 0 to {len(found) - 1}")
+        if mosaic is not None:
+            pattern_of(mosaic)
         return mosaic
 
     @field_validator("camera_to_reference")
@@ -231,8 +226,3 @@ def sensor_to_toml(sensor: SensorFile, comments: tuple[str, ...] = ()) -> str:
     if sensor.camera is not None:
         content["camera"] = {k: v for k, v in content["camera"].items() if v != ()}
     return "".join(f"# {line}\n" for comment in comments for line in comment.splitlines()) + tomli_w.dumps(content)
-
-
-def save_sensor(sensor: SensorFile, path: Path, comments: tuple[str, ...] = ()) -> None:
-    """Write a sensor file, atomically."""
-    write_text(path, sensor_to_toml(sensor, comments))

@@ -20,7 +20,7 @@ from mmsynth.errors import InputError
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.mosaic import channel_map
 from mmsynth.sensors.noise import generator, record
-from mmsynth.sensors.polarization import analyser_axes, frame_angle, reference_axes
+from mmsynth.sensors.polarization import analyser_axes, analyser_matrix, frame_angle, reference_axes
 from mmsynth.sensors.sensor_file import SensorFile
 
 
@@ -103,20 +103,18 @@ class SensorTwin(nn.Module):
     def _analyser_map(self) -> Tensor:
         """(3, H, W) or, without mosaic, (C, 3, H, W): what of S0, S1, S2 a photosite measures."""
         polarizers = [c.polarizer for c in self.sensor.channels]
-        column = lambda values: torch.tensor(values, dtype=torch.float64)
-        angle = torch.deg2rad(column([p.angle_deg if p else 0.0 for p in polarizers]))
-        contrast = column([1.0 - 2.0 / (p.extinction_ratio + 1.0) if p else 0.0 for p in polarizers])
-        passed = column([p.throughput if p else 1.0 for p in polarizers])
+        # without a polarizer: angle, throughput and extinction ratio of no analyser
+        figures = [(p.angle_deg, p.throughput, p.extinction_ratio) if p else (0.0, 1.0, 1.0) for p in polarizers]
+        angle, passed, ratio = torch.tensor(figures, dtype=torch.float64).T
         # per photosite, or per channel everywhere
         which = self.channel if self.mosaic is not None else torch.arange(len(polarizers))[:, None, None].expand(-1, *self.channel.shape)
-        angles = angle[which]
+        angles = torch.deg2rad(angle)[which]
         if self.sensor.polarizer_angle_sd_deg:
             random = generator(self.seed, self.sensor.name, "polarizer angle")
             angles = angles + math.radians(self.sensor.polarizer_angle_sd_deg) * torch.randn(angles.shape, generator=random).double()
         if self.sensor.off_axis != "ideal":
             angles = self._as_rays_meet_them(angles)
-        s1, s2 = contrast[which] * torch.cos(2.0 * angles), contrast[which] * torch.sin(2.0 * angles)
-        return 0.5 * passed[which][..., None, :, :] * torch.stack([torch.ones_like(s1), s1, s2], -3)
+        return analyser_matrix(torch.rad2deg(angles), passed[which], ratio[which]).movedim(-1, -3).contiguous()
 
     def _as_rays_meet_them(self, angles: Tensor) -> Tensor:
         """Angles (..., H, W) of analysers on the sensor → in each ray's own reference axes."""

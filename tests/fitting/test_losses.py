@@ -11,7 +11,8 @@ from conftest import ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmsynth.fitting.losses import eikonal, photometric, predict, residual
+from mmsynth.field.kernels import photometric, predict, residual
+from mmsynth.fitting.losses import eikonal
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Sensor
@@ -133,9 +134,9 @@ def test_a_batch_without_polarization_has_no_axes(measurements: dict[str, Measur
     batch = draw({n: measurements[n] for n in names}, COLUMNS, dict.fromkeys(names, 5), np.random.default_rng(0), CPU)
     assert batch.axes.shape == (0, 3)
     outputs = torch.randn(10, 19)
-    torch.testing.assert_close(predict(outputs, torch.ones(10), batch), _predicted_plainly(outputs, torch.ones(10), batch))
+    torch.testing.assert_close(predict(outputs, torch.ones(10), batch.measured), _predicted_plainly(outputs, torch.ones(10), batch))
     only = draw({"pol": measurements["pol"]}, COLUMNS, {"pol": 5}, np.random.default_rng(0), CPU)
-    torch.testing.assert_close(predict(outputs[:5], torch.ones(5), only), _predicted_plainly(outputs[:5], torch.ones(5), only))
+    torch.testing.assert_close(predict(outputs[:5], torch.ones(5), only.measured), _predicted_plainly(outputs[:5], torch.ones(5), only))
 
 
 def test_the_same_random_state_draws_the_same_batch(measurements: dict[str, Measurements]) -> None:
@@ -163,7 +164,7 @@ def test_predictions_are_the_formulas_of_each_modality(batch: Batch) -> None:
     torch.manual_seed(0)
     rays = len(batch.origins)
     outputs, opacity = torch.randn(rays, 19, requires_grad=True), torch.rand(rays, requires_grad=True)
-    found = predict(outputs, opacity, batch)
+    found = predict(outputs, opacity, batch.measured)
     torch.testing.assert_close(found, _predicted_plainly(outputs.detach(), opacity.detach(), batch), rtol=1e-5, atol=1e-7)
     # what a ray did not measure is not pulled at
     found.sum().backward()
@@ -188,7 +189,7 @@ def test_the_loss_is_a_mean_over_modalities_of_hubers_of_relative_residuals(batc
         relative = np.abs(difference) / float(batch.level[numbers][0])
         huber = np.where(relative < 0.5, 0.5 * relative**2, 0.5 * (relative - 0.25))
         total += huber.mean() / len(batch.parts)
-    assert float(photometric(residual(predicted, batch), batch)) == pytest.approx(total, rel=1e-5)
+    assert float(photometric(residual(predicted, batch.measured), batch.measured)) == pytest.approx(total, rel=1e-5)
 
 
 def _alone(target: list[float], saturation: float, level: float) -> Batch:
@@ -202,18 +203,18 @@ def _alone(target: list[float], saturation: float, level: float) -> Batch:
 
 
 def test_saturated_targets_only_pull_upwards() -> None:
-    difference = residual(torch.tensor([1.5, 0.5, 1.5]), _alone([1.0, 1.0, 0.9], 0.998, 1.0))
+    difference = residual(torch.tensor([1.5, 0.5, 1.5]), _alone([1.0, 1.0, 0.9], 0.998, 1.0).measured)
     torch.testing.assert_close(difference, torch.tensor([0.0, -0.5, 0.6]))
     # a float image never clips
-    assert residual(torch.tensor([9.0]), _alone([7.0], float("inf"), 1.0)).tolist() == [2.0]
+    assert residual(torch.tensor([9.0]), _alone([7.0], float("inf"), 1.0).measured).tolist() == [2.0]
 
 
 @settings(deadline=None)
 @given(st.floats(1e-4, 1e3))
 def test_dark_modalities_weigh_as_much_as_bright_ones(level: float) -> None:
     relative = torch.linspace(-2, 2, 9)
-    loss = photometric(relative * level, _alone([0.0] * 9, 1.0, level))
-    assert float(loss) == pytest.approx(float(photometric(relative, _alone([0.0] * 9, 1.0, 1.0))), rel=1e-5)
+    loss = photometric(relative * level, _alone([0.0] * 9, 1.0, level).measured)
+    assert float(loss) == pytest.approx(float(photometric(relative, _alone([0.0] * 9, 1.0, 1.0).measured)), rel=1e-5)
 
 
 def test_eikonal_is_zero_for_distances_alone() -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from mmsynth.errors import InputError
+from mmsynth.files import write_text
 from mmsynth.packaged import data_folder
 from mmsynth.sensors.camera import Camera, Lens
 from mmsynth.sensors.noise import NoiseModel
@@ -23,7 +24,6 @@ from mmsynth.sensors.sensor_file import (
     SensorFile,
     find_sensor_file,
     load_sensor,
-    save_sensor,
     sensor_to_toml,
 )
 
@@ -91,7 +91,7 @@ def test_there_are_packaged_sensors_of_both_kinds() -> None:
 @pytest.mark.parametrize("path", PACKAGED, ids=lambda p: p.stem)
 def test_packaged_sensors_come_back_from_their_text(path: Path, tmp_path: Path) -> None:
     file = load_sensor(path)
-    save_sensor(file, tmp_path / "copy.toml", ("what it is", "and from where"))
+    write_text(tmp_path / "copy.toml", sensor_to_toml(file, ("what it is", "and from where")))
     assert (tmp_path / "copy.toml").read_text(encoding="utf-8").startswith("# what it is\n# and from where\n")
     assert load_sensor(tmp_path / "copy.toml") == file
 

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
-from mmsynth.files import write_atomic, write_json
+from mmsynth.files import write_atomic, write_json, write_text
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.images import read_native, used_bits
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality
@@ -27,7 +27,7 @@ from mmsynth.sensors.filters import gaussian_mean
 from mmsynth.sensors.mosaic import channel_map, crop_pattern, photosites_of
 from mmsynth.sensors.noise import NoiseModel
 from mmsynth.sensors.photon_transfer import UNCLIPPED, PhotonTransfer, photon_transfer_of_frames
-from mmsynth.sensors.sensor_file import SensorFile, save_sensor
+from mmsynth.sensors.sensor_file import SensorFile, sensor_to_toml
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -283,7 +283,7 @@ def by_modality(files: Sequence[SensorFile]) -> dict[str, SensorFile]:
 def write(calibrated: Mapping[str, Calibrated], out: Path) -> None:
     """``NAME.toml`` for each sensor, ``noise.svg`` and ``noise.json``."""
     for name, c in calibrated.items():
-        save_sensor(c.file, out / f"{name}.toml", c.comments())
+        write_text(out / f"{name}.toml", sensor_to_toml(c.file, c.comments()))
     write_atomic(out / "noise.svg", lambda path: FigureCanvasSVG(noise_figure(calibrated)).print_svg(path, metadata={"Date": None}))
     write_json(out / "noise.json", {name: c.to_json() for name, c in calibrated.items()})
 

@@ -36,16 +36,14 @@ def read_images_txt(path: Path) -> list[StatedPose]:
     cameras = _cameras(path.with_name("cameras.txt"))
     out: list[StatedPose] = []
     points_expected = False
-    for row, line in enumerate(text_lines(path), 1):
-        tokens = line.split()
+    for where, tokens in text_lines(path):
         # a points line holds triples and may be empty or, in some files, left out; an image line never has 3 n tokens
         # unless the name has spaces, and then it comes where no points line is expected
-        if points_expected and len(tokens) % 3 == 0 and not line.startswith("#"):
+        if points_expected and len(tokens) % 3 == 0:
             points_expected = False
             continue
-        if not tokens or line.startswith("#"):
+        if not tokens:
             continue
-        where = f"{path}: line {row}"
         if len(tokens) < 10:
             raise InputError(f"{where}: {len(tokens)} values, expected '{_LINE}'.")
         values = floats(tokens[1:8], where, _LINE)
@@ -67,22 +65,20 @@ def _cameras(path: Path) -> dict[int, Camera] | None:
     if not path.is_file():
         return None
     out: dict[int, Camera] = {}
-    for row, line in enumerate(text_lines(path), 1):
-        tokens = line.split()
-        if not tokens or line.startswith("#"):
+    for where, tokens in text_lines(path):
+        if not tokens:
             continue
-        where = f"{path}: line {row}"
         if len(tokens) < 4 or tokens[1] not in _MODELS:
             models = " ".join(_MODELS)
             raise InputError(f"{where}: unsupported camera, expected 'id model width height ...' with one of the models {models}.")
         names = _MODELS[tokens[1]].split()
         try:
-            identity, width, height = int(tokens[0]), int(tokens[2]), int(tokens[3])
+            identity, size = int(tokens[0]), (int(tokens[2]), int(tokens[3]))
             value = dict(zip(names, map(float, tokens[4:]), strict=True))
         except ValueError as error:
             raise InputError(f"{where}: expected {len(names)} numbers ({' '.join(names)}) after the size.") from error
         lens: Lens = "kannala_brandt" if tokens[1] == "OPENCV_FISHEYE" else "brown_conrady"
         distortion = [value.get(key, 0.0) for key in COEFFICIENTS[lens]]
-        fx, fy = value.get("fx", value.get("f", 0.0)), value.get("fy", value.get("f", 0.0))
-        out[identity] = make_camera(where, width, height, fx, fy, value["cx"] - 0.5, value["cy"] - 0.5, distortion, lens)
+        fx, fy = (value[key] if key in value else value["f"] for key in ("fx", "fy"))
+        out[identity] = make_camera(where, size, (fx, fy, value["cx"] - 0.5, value["cy"] - 0.5), distortion, lens)
     return out

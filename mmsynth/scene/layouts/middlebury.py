@@ -13,36 +13,27 @@ from pathlib import Path
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.scene.checks import is_file, make_camera, rigid_pose, text_lines
+from mmsynth.scene.checks import floats, is_file, make_camera, rigid_pose, text_lines
 from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.region import region_from_cameras
-from mmsynth.scene.scene import Frame, Region, Scene, make_split
+from mmsynth.scene.scene import Frame, Region, Scene, ball, make_split
 
 
 def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scene:
-    """Read a Middlebury scene; images that are listed and missing are left out.
-
-    Args:
-        root: folder with the images and one ``*_par.txt``.
-        modalities: names or aliases to read; None: all (there is one: rgb, or mono for grey images).
-    Raises:
-        InputError: wrong line, skew in K, pose that is not finite and rigid, or no image at all.
-    """
-    root = Path(root)
+    """Read the scene in a folder, as ``load_scene``: one modality, rgb, or mono for grey images. What is listed and missing is left out."""
     files = sorted(root.glob("*_par.txt"))
     if len(files) != 1:
         raise InputError(f"{root}: {len(files)} files match *_par.txt, expected one.")
     path = files[0]
-    found: list[tuple[int, Path, np.ndarray, np.ndarray]] = []
+    found: list[tuple[int, Path, list[float], np.ndarray]] = []
     missing = 0
-    lines = [(row, line.split()) for row, line in enumerate(text_lines(path), 1) if line.strip()]
+    lines = [line for line in text_lines(path) if line[1]]
     lines = lines[1:] if lines and len(lines[0][1]) == 1 else lines  # the count of images
-    for view, (row, tokens) in enumerate(lines):
-        where = f"{path}: line {row}"
-        matrix, pose = _parse(tokens, where)
+    for view, (where, tokens) in enumerate(lines):
+        intrinsics, pose = _parse(tokens, where)
         if is_file(root / tokens[0]):
-            found.append((view, root / tokens[0], matrix, pose))
+            found.append((view, root / tokens[0], intrinsics, pose))
         else:
             missing += 1
     if not found:
@@ -52,8 +43,8 @@ def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scen
     wanted_modalities([name], modalities, path)
     height, width = first.shape[:2]
     frames = tuple(
-        Frame(name, view, image, make_camera(f"{path}: view {view}", width, height, *_focal_and_centre(k), ()), pose, name)
-        for view, image, k, pose in found
+        Frame(name, view, image, make_camera(f"{path}: view {view}", (width, height), intrinsics), pose, name)
+        for view, image, intrinsics, pose in found
     )
     region = _stated_region(root) or region_from_cameras([f.camera for f in frames], [f.camera_to_world for f in frames])
     problems = (f"{missing} of {missing + len(found)} frames have no image file and are left out.",) if missing else ()
@@ -61,14 +52,11 @@ def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scen
     return Scene(root, "Middlebury", sensors, frames, region, make_split(f.view for f in frames), problems=problems)
 
 
-def _parse(tokens: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """K (3, 3) with K[2, 2] = 1, and camera_to_world (4, 4)."""
-    try:
-        values = np.array([float(token) for token in tokens[1:]])
-    except ValueError as error:
-        raise InputError(f"{where}: not a number, expected 'name' and the 21 numbers of K, R and t.") from error
-    if values.shape != (21,) or not np.isfinite(values).all():
-        raise InputError(f"{where}: {len(values)} numbers or one not finite, expected 'name' and the 21 finite numbers of K, R and t.")
+def _parse(tokens: Sequence[str], where: str) -> tuple[list[float], np.ndarray]:
+    """fx, fy, cx, cy and camera_to_world (4, 4)."""
+    values = floats(tokens[1:], where, "name, K, R, t")
+    if len(values) != 21:
+        raise InputError(f"{where}: {len(values)} numbers, expected 'name' and the 21 numbers of K, R and t.")
     matrix = values[:9].reshape(3, 3)
     if matrix[2, 2] <= 0 or np.abs(matrix[[1, 2, 2], [0, 0, 1]]).max() > 0:
         raise InputError(f"{where}: K is not upper triangular with a positive last entry.")
@@ -79,11 +67,7 @@ def _parse(tokens: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = world_to_camera[:3, :3].T
     camera_to_world[:3, 3] = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
-    return matrix, camera_to_world
-
-
-def _focal_and_centre(matrix: np.ndarray) -> tuple[float, float, float, float]:
-    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), camera_to_world
 
 
 def _stated_region(root: Path) -> Region | None:
@@ -100,5 +84,4 @@ def _stated_region(root: Path) -> Region | None:
     except ValueError:
         return None
     radius = float(np.linalg.norm(corners[1] - corners[0]) / 2)
-    x, y, z = corners.mean(0)
-    return Region((float(x), float(y), float(z)), radius) if radius > 0 else None
+    return ball(corners.mean(0), radius) if radius > 0 else None

@@ -26,7 +26,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
-from mmsynth.scene.checks import is_file, is_number, number, numbers, objects, rigid_pose, whole
+from mmsynth.scene.checks import is_file, is_number, make_camera, number, numbers, objects, rigid_pose, whole
 from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import KNOWN, make_sensor, wanted_modalities
 from mmsynth.scene.scene import (
@@ -39,6 +39,7 @@ from mmsynth.scene.scene import (
     Sensor,
     Split,
     StatedPose,
+    ball,
     canonical_modality,
     make_split,
 )
@@ -49,21 +50,12 @@ _MODELS = (*_PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
-    """Read an MMS-DATA scene.
-
-    Args:
-        root: folder with ``meta_data.json``.
-        modalities: names or aliases to read; None: all.
-    Raises:
-        InputError: missing or wrong key, pose that is not finite and rigid, unknown modality, a modality without images.
-    """
-    root = Path(root)
+    """Read the scene in a folder, as ``load_scene``. A modality without images is refused."""
     path = root / "meta_data.json"
     meta = _read_meta(path)
-    raw, undistorted = _flag(meta, "raw", path), _flag(meta, "undistorted", path)
+    raw = _flag(meta, "raw", path)
     to_output, scale, unit = _world_to_output(meta, path)
     unit = str(meta.get("unit", unit))
-    offset = _pixel_offset(meta, path)
 
     sources = {source: canonical_modality(source) for source in meta["modalities"]}
     for name, count in Counter(sources.values()).items():
@@ -78,7 +70,7 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
             continue
         where = f"{path}: modality '{source}'"
         entry = _modality(meta, source, where)
-        camera = _camera(entry, where, undistorted, offset)
+        camera = _camera(meta, entry, path, where)
         present, missing = _frames(entry, where, root, source, name, camera, to_output, scale)
         if not present:
             raise InputError(f"{where} has no image files in {root / 'modalities' / source}; leave it out to use the other modalities.")
@@ -88,27 +80,23 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
         frames += present
     split = _split(root, meta["modalities"], (frame.view for frame in frames))
     box = meta.get("scene_box")
-    radius = number(box, "radius", f"{path}: key 'scene_box'") if isinstance(box, dict) and "radius" in box else 1.0
+    radius = number(box if isinstance(box, dict) else {}, "radius", f"{path}: key 'scene_box'", default=1.0)
     if radius <= 0:
         raise InputError(f"{path}: key 'scene_box': radius {radius}, expected a positive number.")
-    centre = to_output[:3, 3]
-    region = Region((float(centre[0]), float(centre[1]), float(centre[2])), scale * radius)
+    region = ball(to_output[:3, 3], scale * radius)
     return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
 
 
 def read_reference_poses(path: Path) -> list[StatedPose]:
     """Poses of the reference sensor, the first modality of a ``meta_data.json``: by frame id, with or without image files.
 
-    Returns:
-        poses in the frame and unit of ``read_mmsdata``, named by the stems of their files.
-    Raises:
-        InputError: missing or wrong key, or a pose that is not finite and rigid.
+    They are in the frame and unit of ``read_mmsdata``, named by the stems of their files.
     """
     meta = _read_meta(path)
     source = next(iter(meta["modalities"]))
     where = f"{path}: modality '{source}'"
     entry = _modality(meta, source, where)
-    camera = _camera(entry, where, _flag(meta, "undistorted", path), _pixel_offset(meta, path))
+    camera = _camera(meta, entry, path, where)
     to_output, scale, _ = _world_to_output(meta, path)
     frames = sorted(_stated_frames(entry, where, to_output, scale), key=lambda frame: frame[0])
     return [StatedPose(camera, pose, Path(file_name).stem) for _, file_name, pose in frames]
@@ -183,10 +171,6 @@ def _modality(meta: Mapping[str, Any], source: str, where: str) -> dict[str, Any
     return entry
 
 
-def _pixel_offset(meta: Mapping[str, Any], path: Path) -> float:
-    return number(meta, "pixel_offset", str(path)) if "pixel_offset" in meta else 0.0
-
-
 def _flag(meta: Mapping[str, Any], key: str, path: Path) -> bool:
     if not isinstance(meta.get(key), bool):
         raise InputError(f"{path}: key '{key}' is {meta.get(key, 'missing')!r}, expected true or false.")
@@ -212,28 +196,21 @@ def _world_to_output(meta: Mapping[str, Any], path: Path) -> tuple[np.ndarray, f
         raise InputError(f"{where} is not a similarity, expected a rotation, one scale and a translation.") from error
 
 
-def _camera(entry: Mapping[str, Any], where: str, undistorted: bool, offset: float) -> Camera:
+def _camera(meta: Mapping[str, Any], entry: Mapping[str, Any], path: Path, where: str) -> Camera:
+    offset = number(meta, "pixel_offset", str(path), default=0.0)
+    undistorted = _flag(meta, "undistorted", path)
     model = str(entry.get("camera_model", "OPENCV")).upper()
     if model not in _MODELS:
         raise InputError(f"{where}: camera_model {model} is not supported yet, expected one of {' '.join(_MODELS)}.")
-    distortion: tuple[float, ...] = ()
+    distortion: list[float] = []
     if not undistorted and model not in _PINHOLE_MODELS:
         given = entry.get("distortion_params")
         if not isinstance(given, list) or len(given) != 6 or not all(is_number(value) for value in given):
             raise InputError(f"{where}: key 'distortion_params' is {given}, expected the six numbers k1 k2 p1 p2 k3 k4.")
-        distortion = tuple(float(value) for value in given) if any(given) else ()
-    try:
-        return Camera(
-            width=whole(entry, "width", where),
-            height=whole(entry, "height", where),
-            fx=number(entry, "fx", where),
-            fy=number(entry, "fy", where),
-            cx=number(entry, "cx", where) - offset,
-            cy=number(entry, "cy", where) - offset,
-            distortion=distortion,
-        )
-    except InputError as error:
-        raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from error
+        distortion = [float(value) for value in given]
+    size = whole(entry, "width", where), whole(entry, "height", where)
+    fx, fy, cx, cy = (number(entry, key, where) for key in ("fx", "fy", "cx", "cy"))
+    return make_camera(where, size, (fx, fy, cx - offset, cy - offset), distortion)
 
 
 def _frames(

@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,30 +48,29 @@ _MODEL_OF: dict[str, str] = {"brown_conrady": "OPENCV", "kannala_brandt": _FISHE
 
 
 def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scene:
-    """Read a nerfstudio or instant-ngp scene.
-
-    Args:
-        path: the folder with ``transforms.json``, or the JSON file itself.
-        modalities: names or aliases to read; None: all.
-    Raises:
-        InputError: wrong key, unknown lens model, pose that is not finite and rigid, or no image at all.
-    """
-    path = Path(path)
+    """Read the scene in a folder with ``transforms.json``, or of the JSON file itself, as ``load_scene``."""
     path = path / "transforms.json" if path.is_dir() else path
     root = path.parent
     meta = read_json(path)
     if not isinstance(meta, dict):
         raise InputError(f"{path}: a JSON {type(meta).__name__}, expected an object with the key 'frames'.")
     listed = objects(meta, "frames", path)
-    images = _images(root, listed, path)
+    found = {index: _image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)}
+    images = {index: image for index, image in found.items() if image is not None}
+    if not images:
+        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
     problems = _missing(listed, images)
     first: dict[str, np.ndarray] = {}  # by modality as the file spells it: the first image, for size and channels
     for index, file in images.items():
         if _source(listed[index]) not in first:
             first[_source(listed[index])] = read_native(file)
-    names = {source: canonical_modality(source) if source else _default_modality(image) for source, image in first.items()}
+    default = lambda image: "mono" if image.ndim == 2 or image.shape[2] == 2 else "rgb"
+    names = {source: canonical_modality(source) if source else default(image) for source, image in first.items()}
     wanted = wanted_modalities(dict.fromkeys(names.values()), modalities, path)
-    described = _described(meta, path)
+    described = meta.get("modalities", {})
+    if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
+        raise InputError(f"{path}: key 'modalities' is not an object of objects.")
+    described = {canonical_modality(name): entry for name, entry in described.items()}
     sensors: dict[str, Sensor] = {}
     for source, image in first.items():
         if names[source] in wanted and names[source] not in sensors:
@@ -78,7 +78,8 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
             sensors[names[source]] = make_sensor(names[source], entry, str(path), image, raw="mosaick_pattern" in entry)
     sizes = {source: (image.shape[1], image.shape[0]) for source, image in first.items() if names[source] in sensors}
     frames = _frames(meta, listed, images, names, sizes, path)
-    alpha = any(_has_alpha(first[source], sensors[names[source]]) for source in sizes)
+    plain = {source: sensors[names[source]].channel_count for source in sizes if sensors[names[source]].mosaic is None}
+    alpha = any(first[source].ndim == 3 and first[source].shape[2] > count for source, count in plain.items())
     region = _region(meta, root, sensors, frames, problems)
     split = _split(meta, frames, path)
     return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", True if alpha else None, tuple(problems))
@@ -89,25 +90,14 @@ def _source(frame: Mapping[str, Any]) -> str:
     return str(frame.get("modality", ""))
 
 
-def _images(root: Path, listed: Sequence[Mapping[str, Any]], path: Path) -> dict[int, Path]:
-    """The image of each frame that has one, by the frame's position in the list."""
-    found = {index: _image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)}
-    images = {index: image for index, image in found.items() if image is not None}
-    if not images:
-        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
-    return images
-
-
 def _missing(listed: Sequence[Mapping[str, Any]], images: Mapping[int, Path]) -> list[str]:
     """A sentence about frames, and one about each modality, without images."""
     problems = []
     if len(images) < len(listed):
         problems.append(f"{len(listed) - len(images)} of {len(listed)} frames have no image file and are left out.")
     there = {_source(listed[index]) for index in images}
-    for source in dict.fromkeys(map(_source, listed)):
-        if source not in there:
-            problems.append(f"{source or 'the default modality'}: none of its frames has an image file, it is left out.")
-    return problems
+    lost = [source or "the default modality" for source in dict.fromkeys(map(_source, listed)) if source not in there]
+    return problems + [f"{name}: none of its frames has an image file, it is left out." for name in lost]
 
 
 def _frames(
@@ -120,12 +110,12 @@ def _frames(
 ) -> list[Frame]:
     """Frames with an image, of the modalities whose sizes are given, by sensor and view; every pose in the list is checked."""
     frames: list[Frame] = []
-    positions: dict[str, int] = {}
+    count: Counter[str] = Counter()  # of frames of the same modality before, with an image or without
     for index, frame in enumerate(listed):
         source = _source(frame)
         where = f"{path}: frame {index} ({frame['file_path']})"
-        position = positions.get(source, 0)
-        positions[source] = position + 1
+        position = count[source]
+        count[source] += 1
         pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
         if index not in images or source not in sizes:
             continue
@@ -178,21 +168,6 @@ def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None
     # appended, not replaced: "0001.rgb" is a name without extension
     candidates = [path] if path.suffix.lower() in SUFFIXES else [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     return next((candidate for candidate in candidates if is_file(candidate)), None)
-
-
-def _default_modality(image: np.ndarray) -> str:
-    return "mono" if image.ndim == 2 or image.shape[2] == 2 else "rgb"
-
-
-def _described(meta: Mapping[str, Any], path: Path) -> dict[str, Mapping[str, Any]]:
-    given = meta.get("modalities", {})
-    if not isinstance(given, dict) or not all(isinstance(entry, dict) for entry in given.values()):
-        raise InputError(f"{path}: key 'modalities' is not an object of objects.")
-    return {canonical_modality(name): entry for name, entry in given.items()}
-
-
-def _has_alpha(image: np.ndarray, sensor: Sensor) -> bool:
-    return sensor.mosaic is None and image.ndim == 3 and image.shape[2] > sensor.channel_count
 
 
 def _split(meta: Mapping[str, Any], frames: Sequence[Frame], path: Path) -> Split:
@@ -255,7 +230,7 @@ def read_camera_path(content: Mapping[str, Any], path: Path) -> list[StatedPose]
             if not 0 < fov < 180:
                 raise InputError(f"{where}: key 'fov' is {fov}, expected between 0 and 180 degrees.")
             focal = float(height / 2 / np.tan(np.radians(fov) / 2))
-            camera = make_camera(where, width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5, ())
+            camera = make_camera(where, (width, height), (focal, focal, width / 2 - 0.5, height / 2 - 0.5))
         out.append(StatedPose(camera, rigid_pose(matrix.reshape(4, 4), where) @ OPENGL_TO_OPENCV, f"{index:04d}"))
     return out
 
@@ -267,12 +242,7 @@ def _camera(shared: Mapping[str, Any], frame: Mapping[str, Any], where: str, siz
     Kannala-Brandt's. Keys that are missing: coefficients = 0, cx, cy = image centre, fl_y = fl_x, and fl_x, fl_y from
     camera_angle_x, camera_angle_y [rad].
 
-    Args:
-        size: width, height of the image for files without w and h.
-    Returns:
-        None when there is neither a focal length nor an angle, or no size.
-    Raises:
-        InputError: bad number, or another lens model.
+    ``size``: width, height of the image, for files without w and h. None when there is neither a focal length nor an angle, or no size.
     """
     merged = {**shared, **frame}
     model = str(merged.get("camera_model", "OPENCV")).upper()
@@ -290,11 +260,10 @@ def _camera(shared: Mapping[str, Any], frame: Mapping[str, Any], where: str, siz
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
         return None
-    cx = number(merged, "cx", where) if "cx" in merged else width / 2
-    cy = number(merged, "cy", where) if "cy" in merged else height / 2
+    cx, cy = number(merged, "cx", where, default=width / 2), number(merged, "cy", where, default=height / 2)
     lens: Lens = "kannala_brandt" if fisheye else "brown_conrady"
-    distortion = [number(merged, key, where) if key in merged else 0.0 for key in COEFFICIENTS[lens]]
-    return make_camera(where, width, height, fx, fy, cx - 0.5, cy - 0.5, distortion, lens)
+    distortion = [number(merged, key, where, default=0.0) for key in COEFFICIENTS[lens]]
+    return make_camera(where, size, (fx, fy, cx - 0.5, cy - 0.5), distortion, lens)
 
 
 def _focal(entry: Mapping[str, Any], axis: str, pixels: int, where: str) -> float | None:

@@ -19,8 +19,7 @@ def is_tum(path: Path) -> bool:
         return True
     if path.suffix.lower() != ".txt" or path.name.lower() == "images.txt":
         return False
-    content = (line.split() for line in text_lines(path))
-    return len(next((tokens for tokens in content if tokens and not tokens[0].startswith("#")), [])) <= 8
+    return len(next((tokens for _, tokens in text_lines(path) if tokens), [])) <= 8
 
 
 def read_tum(path: Path) -> list[StatedPose]:
@@ -30,11 +29,9 @@ def read_tum(path: Path) -> list[StatedPose]:
         InputError: a line that is not of eight finite numbers, or a quaternion that is not of unit length.
     """
     out: list[StatedPose] = []
-    for row, line in enumerate(text_lines(path), 1):
-        tokens = line.split()
-        if not tokens or line.lstrip().startswith("#"):
+    for where, tokens in text_lines(path):
+        if not tokens:
             continue
-        where = f"{path}: line {row}"
         if len(tokens) != 8:
             raise InputError(f"{where}: {len(tokens)} values, expected '{_LINE}'.")
         values = floats(tokens, where, _LINE)

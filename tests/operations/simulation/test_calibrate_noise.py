@@ -13,6 +13,7 @@ from analytic import MONO, MS, POL, RGB, AnalyticField, ring_pose, sphere
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
+from mmsynth.files import write_text
 from mmsynth.operations.simulation.calibrate_noise import by_modality, calibrate_from_frames, calibrate_noise, write
 from mmsynth.operations.simulation.simulate import simulate
 from mmsynth.scene.image_writers import write_npz, write_png
@@ -20,7 +21,7 @@ from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.noise import NoiseModel, record
-from mmsynth.sensors.sensor_file import SensorFile, load_sensor, save_sensor
+from mmsynth.sensors.sensor_file import SensorFile, load_sensor, sensor_to_toml
 
 TRUE = NoiseModel(bits=12, gain_dn_e=0.4, full_well_e=1.2e4, read_e=6.0, black_dn=64.0, prnu=0.01)
 
@@ -40,7 +41,7 @@ class RoughField(AnalyticField):
 
 def sensor_file(name: str, folder: Path) -> Path:
     path = folder / f"{name}.toml"
-    save_sensor(SensorFile.model_validate({"name": name, "instance_of": name, "noise": TRUE}), path)
+    write_text(path, sensor_to_toml(SensorFile.model_validate({"name": name, "instance_of": name, "noise": TRUE})))
     return path
 
 
