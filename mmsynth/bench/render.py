@@ -11,9 +11,10 @@ import copy
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -203,29 +204,33 @@ def _samples(bed: Bed, way: Way) -> float:
 # --- families
 
 
+def _ways(bed: Bed, variants: Mapping[str, Mapping[str, Any]]) -> list[Way]:
+    """For one modality and for all, one of each name, which differs from the field's own way by some figures."""
+    own = {"sampling": bed.field.sampling}
+    return [Way(problem, name, names, **{**own, **change}) for problem, names in bed.sets.items() for name, change in variants.items()]
+
+
+def _values(sampling: Sampling, key: str, values: Sequence[float]) -> dict[str, dict[str, Sampling]]:
+    """Samplings with these values of a figure, and with its own."""
+    own = getattr(sampling, key)
+    return {f"{key} {v:g}{_own(v == own)}": {"sampling": sampling._replace(**{key: v})} for v in sorted({*values, own})}
+
+
+def _own(yes: bool) -> str:
+    return " (the field's)" if yes else ""
+
+
 def termination(bed: Bed) -> list[Way]:
     """The optical depth at which a ray ends."""
-    s = bed.field.sampling
-    values = sorted({1.0, 2.0, 3.0, 5.0, 8.0, s.max_optical_depth})
-    return [
-        Way(problem, f"max_optical_depth {v:g}{_own(v == s.max_optical_depth)}", names, s._replace(max_optical_depth=v))
-        for problem, names in bed.sets.items()
-        for v in values
-    ]
+    return _ways(bed, _values(bed.field.sampling, "max_optical_depth", (1.0, 2.0, 3.0, 5.0, 8.0)))
 
 
 def steps(bed: Bed) -> list[Way]:
     """How a ray is sampled: the step at the surface, the stride towards it, and how much a section weighs that has its own appearance."""
     s = bed.field.sampling
-    variants: list[tuple[str, dict[str, float]]] = [(f"step x {v:g}{_own(v == 1.0)}", {"step": v * s.step}) for v in (0.5, 1.0, 2.0, 4.0)]
-    for name, values in (("sphere_step_factor", (0.4, 0.7, 0.9)), ("min_section_weight", (0.0, 1e-2, 5e-2))):
-        own = getattr(s, name)
-        variants += [(f"{name} {v:g}{_own(v == own)}", {name: v}) for v in sorted({*values, own})]
-    return [
-        Way(problem, name, names, s._replace(**change))  # type: ignore[arg-type]
-        for problem, names in bed.sets.items()
-        for name, change in variants
-    ]
+    lengths = {f"step x {v:g}{_own(v == 1.0)}": {"sampling": s._replace(step=v * s.step)} for v in (0.5, 1.0, 2.0, 4.0)}
+    strides, weights = _values(s, "sphere_step_factor", (0.4, 0.7, 0.9)), _values(s, "min_section_weight", (0.0, 1e-2, 5e-2))
+    return _ways(bed, lengths | strides | weights)
 
 
 def asked(bed: Bed) -> list[Way]:
@@ -237,22 +242,14 @@ def asked(bed: Bed) -> list[Way]:
 
 def tiles(bed: Bed) -> list[Way]:
     """Rays per tile."""
-    return [
-        Way(problem, f"{size} rays{_own(size == TILE)}", names, bed.field.sampling, tile=size)
-        for problem, names in bed.sets.items()
-        for size in (1024, 4096, 8192, 16384, 65536)
-    ]
+    return _ways(bed, {f"{size} rays{_own(size == TILE)}": {"tile": size} for size in (1024, 4096, 8192, 16384, 65536)})
 
 
 def threads(bed: Bed) -> list[Way]:
     """Threads, from one to as many as numba was started with, by doubling."""
     most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     counts = sorted({*(2**i for i in range(most.bit_length()) if 2**i <= most), most})
-    return [Way(p, f"{n} threads", names, bed.field.sampling, threads=n) for p, names in bed.sets.items() for n in counts]
-
-
-def _own(yes: bool) -> str:
-    return " (the field's)" if yes else ""
+    return _ways(bed, {f"{n} threads": {"threads": n} for n in counts})
 
 
 FAMILIES = (termination, steps, asked, tiles, threads)

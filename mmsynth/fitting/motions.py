@@ -71,12 +71,9 @@ class NormalEquations:
     error: np.ndarray
     weight: np.ndarray
 
-    def half(self, index: int) -> NormalEquations:
-        """One of those that ``normal_equations`` keeps apart."""
-        return NormalEquations(self.matrix[index], self.vector[index], self.error[index], self.weight[index])
-
-    def both(self) -> NormalEquations:
-        return NormalEquations(self.matrix.sum(0), self.vector.sum(0), self.error.sum(0), self.weight.sum(0))
+    def of(self, *halves: int) -> NormalEquations:
+        """Of one or both of the halves that ``normal_equations`` keeps apart."""
+        return NormalEquations(*(x[list(halves)].sum(0) for x in (self.matrix, self.vector, self.error, self.weight)))
 
 
 @dataclass(frozen=True)
@@ -203,15 +200,15 @@ def cross_validated_step(
     here = _adjoint(now, now[layout.anchor][layout.view])
     quadratic, linear = np.zeros((2, 2)), np.zeros(2)
     for learned, other in ((0, 1), (1, 0)):
-        step = solve(equations.half(learned), layout, motions, views, rig, prior)
+        step = solve(equations.of(learned), layout, motions, views, rig, prior)
         of_frames = np.stack([_times(here, step.views[layout.view]), step.sensors[layout.sensor]])
-        judge = equations.half(other)
+        judge = equations.of(other)
         quadratic += np.einsum("kfi,fij,lfj->kl", of_frames, judge.matrix, of_frames)
         linear += np.einsum("kfi,fi->k", of_frames, judge.vector)
     factor = np.clip(-np.linalg.lstsq(quadratic, linear, rcond=1e-9)[0], 0.0, 1.0)
     saved = -(2.0 * factor @ linear + factor @ quadratic @ factor) / float(equations.error.sum())
     factor = 2.0 * factor / (1.0 + factor)
-    step = solve(equations.both(), layout, motions, views, rig, prior)
+    step = solve(equations.of(0, 1), layout, motions, views, rig, prior)
     return Motions(factor[0] * step.views, factor[1] * step.sensors), float(saved)
 
 

@@ -95,7 +95,7 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.needs = self.needs.with_choices(self.refinement.choices)
+        self.needs.choices.update(self.refinement.choices)
         self.has_alpha = any(m.has_alpha for m in self.measurements.values())
         self.parts: dict[str, Any] = {
             "field": self.field,
@@ -134,7 +134,7 @@ class Trainer:
                 self._take(state.decided)
         if self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
-            self.needs = self.needs.with_choices(self.refinement.choices)
+            self.needs.choices.update(self.refinement.choices)
         total = sum(self.needs.share.values())
         rays = {n: max(1, int(state.rays * share / total)) for n, share in self.needs.share.items()}
         batch = draw(self.measurements, field.shader.columns, rays, random, self.device)
@@ -149,15 +149,12 @@ class Trainer:
             self._skip("a gradient is not finite")
             return
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, recipe))
-        grids = {
-            "surface.grid.table": (field.surface.grid, sampling.active_surface),
-            "appearance.table": (field.appearance, sampling.active_radiance),
-        }
-        rows = {n: int(grid.offsets[active]) for n, (grid, active) in grids.items()}
+        surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
+        rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
         self.optimiser.step(learning_rate_factor(self.progress, recipe), slower, rows)
         keep = 0.98 if state.step else 0.0
-        first = math.isnan(state.mean_loss)  # also after steps that were skipped
-        state.mean_loss = float(loss.detach()) if first else keep * state.mean_loss + (1 - keep) * float(loss.detach())
+        value = float(loss.detach())
+        state.mean_loss = value if math.isnan(state.mean_loss) else keep * state.mean_loss + (1 - keep) * value  # nan: all were skipped
         for name, error in errors.items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         done = self.progress
@@ -214,11 +211,11 @@ class Trainer:
         for name, rows in kept.items():
             self.optimiser.resize(name, rows)
             self.average.resize(name, rows)
-        self.needs = self.needs.with_choices({"tables": sizes.choice})
+        self.needs.choices["tables"] = sizes.choice
 
     def _take(self, decisions: Decisions) -> None:
         self.field.view_dependence.update({name: choice.value for name, choice in decisions.view_dependence.items()})
-        self.needs = self.needs.with_choices(decisions.choices)
+        self.needs.choices.update(decisions.choices)
 
     def _gradients(self, hits: kernels.Hits, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> torch.Tensor:
         """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""
@@ -278,7 +275,7 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
-        self.needs = self.needs.with_choices(self.refinement.choices)
+        self.needs.choices.update(self.refinement.choices)
         if self.state.decided is not None:
             self._take(self.state.decided)
 
