@@ -23,13 +23,13 @@ from typing import Any
 from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mmsynth.bench.fit import GEOMETRY_COLUMNS, LIGHT_COLUMNS, PSNR_COLUMNS, SPEED_COLUMNS
+from mmsynth.bench.fit import SCORE_COLUMNS, SPEED_COLUMNS
 from mmsynth.bench.jobs import Job, mean_over_modalities, run_jobs
 from mmsynth.bench.machine import measure
 from mmsynth.bench.output import Report, new_figure, write_report
-from mmsynth.bench.tables import Column, Table, lookup
+from mmsynth.bench.tables import Column, Table, lookup, numbers
 from mmsynth.errors import InputError
-from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.recipe import Recipe, recipe_path
 from mmsynth.operations.output.progress import Progress
 from mmsynth.packaged import data_folder
 from mmsynth.scene.scene import canonical_modality
@@ -50,9 +50,8 @@ class Variant(BaseModel):
     @property
     def changes(self) -> dict[str, Any]:
         """What it changes, by name."""
-        given = {"modalities": self.modalities, "frames": self.frames}
         recipe = {f"{section}.{key}": value for section, keys in self.recipe.items() for key, value in keys.items()}
-        return recipe | {key: value for key, value in given.items() if value}
+        return recipe | self.model_dump(include={"modalities", "frames"}, exclude_defaults=True)
 
     def fitted_recipe(self) -> Recipe:
         """The default recipe with the changes."""
@@ -72,13 +71,7 @@ def load_table(name_or_path: str) -> list[Variant]:
         InputError: no such table, broken TOML, an unknown key of a variant or of the recipe, a value out of range, a name used twice, or
             a baseline that changes something.
     """
-    path = Path(name_or_path)
-    if not path.suffix:
-        folder = data_folder("recipes") / "bench"
-        path = folder / f"{name_or_path}.toml"
-        if not path.is_file():
-            known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-            raise InputError(f"table {name_or_path!r}: not found, expected one of {known} or a TOML file.")
+    path = recipe_path(name_or_path, data_folder("recipes") / "bench", "table")
     variants = read_toml(path, _File).variant
     for variant in variants:
         try:
@@ -86,9 +79,9 @@ def load_table(name_or_path: str) -> list[Variant]:
         except ValidationError as error:
             raise InputError(f"{path}: variant {variant.name!r}: recipe.{first_problem(error)}.") from error
     names = [variant.name for variant in variants]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"{path}: variant {twice!r} is there twice, expected one of each name.")
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{path}: variant {name!r} is there twice, expected one of each name.")
     if variants[0].changes:
         raise InputError(f"{path}: variant {names[0]!r} is the first and so the baseline, which must change nothing.")
     return variants
@@ -105,9 +98,7 @@ def bench_ablation(
     progress: Progress | None = None,
     device: str = "cpu",
 ) -> Report:
-    """Fit and score every variant of a table with every seed; the report in ``out`` is renewed after every fit.
-
-    Fits whose result already lies in ``out`` are not made again (``jobs``).
+    """Fit and score every variant of a table with every seed; the report in ``out`` is renewed after every fit (see ``jobs``).
 
     Args:
         table: as for ``load_table``. steps, budget [s]: length of every fit; exactly one. only: names of variants; None: all. The
@@ -122,17 +113,14 @@ def bench_ablation(
         raise InputError(f"seeds {', '.join(map(str, seeds)) or 'none'}: expected one or more, each once.")
     variants = _chosen(load_table(table), only)
     # seed by seed: a bench that was stopped has compared as many variants as it could
-    jobs = {
-        f"{v.name}-seed{seed}": (
-            v,
-            Job(f"{v.name}-seed{seed}", str(scene), v.fitted_recipe(), _canonical(v.modalities), v.frames, seed, steps, budget, device),
-        )
-        for seed in seeds
-        for v in variants
-    }
+    fits = [(v, seed) for seed in seeds for v in variants]
+    jobs = [
+        Job(f"{v.name}-seed{seed}", str(scene), v.fitted_recipe(), _canonical(v.modalities), v.frames, seed, steps, budget, device)
+        for v, seed in fits
+    ]
     results: dict[str, Any] = {"bench": "ablation", "scene": str(scene), "table": table, "machine": measure(), "rows": []}
-    for row in run_jobs([job for _, job in jobs.values()], out, progress):
-        results["rows"].append({**row, "variant": jobs[row["name"]][0].name})
+    for (variant, _), row in zip(fits, run_jobs(jobs, out, progress), strict=True):
+        results["rows"].append({**row, "variant": variant.name})
         results["variants"] = compare(variants, results["rows"])
         report = write_report(results, tables_of(results["variants"]), plot(results["variants"]), out)
     return report
@@ -192,18 +180,8 @@ def _numbers(scores: Mapping[str, Any]) -> dict[str, Any]:
 
 def _minus(row: Mapping[str, Any], baseline: Mapping[str, Any]) -> dict[str, Any]:
     """Row minus baseline where both have a number."""
-    a, b = _numbers(row["scores"]), _numbers(baseline["scores"])
-    modalities = {n: _subtract(m, b["modalities"][n]) for n, m in a["modalities"].items() if n in b["modalities"]}
-    return {
-        "seconds": row["seconds"] - baseline["seconds"],
-        **mean_over_modalities({"modalities": modalities}),
-        "modalities": modalities,
-        "geometry": _subtract(a["geometry"], b["geometry"]),
-    }
-
-
-def _subtract(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:
-    return {key: value - b[key] for key, value in a.items() if key in b}
+    apart = _merge([_numbers(row["scores"]), _numbers(baseline["scores"])], lambda pair: pair[0] - pair[1])
+    return {"seconds": row["seconds"] - baseline["seconds"], **mean_over_modalities(apart), **apart}
 
 
 def _merge(trees: Sequence[Mapping[str, Any]], join: Any) -> dict[str, Any]:
@@ -228,29 +206,23 @@ def tables_of(variants: Sequence[Mapping[str, Any]]) -> list[Table]:
     differences = (
         Column("seconds", "seconds", ".1f"),
         Column("Δ seconds", "difference/seconds", "+.1f"),
-        Column("steps", "steps", ",.0f"),
-        Column("samples/s", "samples_per_s", ",.0f"),
-        Column("raw [dB]", "mean/psnr", ".2f"),
-        Column("Δ raw [dB]", "difference/psnr", "+.2f"),
-        Column("truth [dB]", "mean/psnr_truth", ".2f"),
-        Column("Δ truth [dB]", "difference/psnr_truth", "+.2f"),
+        *numbers(",.0f", {"steps": "steps", "samples/s": "samples_per_s"}),
+        *numbers(".2f", {"raw [dB]": "mean/psnr", "truth [dB]": "mean/psnr_truth"}),
+        *numbers("+.2f", {"Δ raw [dB]": "difference/psnr", "Δ truth [dB]": "difference/psnr_truth"}),
         Column("Δ Chamfer", "difference/geometry/chamfer_visible", "+.2g"),
     )
+    together = {"together over alone, raw [dB]": "together/psnr", "together over alone, truth [dB]": "together/psnr_truth"}
     per_modality = (
         Column("modality", "modality"),
-        Column("raw [dB]", "psnr", ".2f"),
-        Column("Δ raw [dB]", "difference/psnr", "+.2f"),
-        Column("truth [dB]", "psnr_truth", ".2f"),
-        Column("Δ truth [dB]", "difference/psnr_truth", "+.2f"),
-        Column("together over alone, raw [dB]", "together/psnr", "+.2f"),
-        Column("together over alone, truth [dB]", "together/psnr_truth", "+.2f"),
+        *numbers(".2f", {"raw [dB]": "psnr", "truth [dB]": "psnr_truth"}),
+        *numbers("+.2f", {"Δ raw [dB]": "difference/psnr", "Δ truth [dB]": "difference/psnr_truth"} | together),
     )
     changes = [{**v, "changed": ", ".join(f"{key} = {value}" for key, value in v["changes"].items()) or "nothing"} for v in variants]
     spread = "Δ: the variant minus the baseline of the same seed, over the modalities that both have; ±: standard deviation over the seeds."
     alone = "Together over alone: what the baseline's other modalities give to one that a variant fits alone."
     return [
         Table("Against the baseline", (name, seeds, *differences), variants, spread),
-        Table("Scores", (name, *PSNR_COLUMNS, *LIGHT_COLUMNS, *GEOMETRY_COLUMNS), variants, "Means over the seeds."),
+        Table("Scores", (name, *SCORE_COLUMNS), variants, "Means over the seeds."),
         Table("Per modality", (name, *per_modality), _per_modality(variants), alone),
         Table("Speed", (name, *(c for c in SPEED_COLUMNS if c.path != "seed")), variants),
         Table("Variants", (name, Column("changes", "changed"), Column("why", "why")), changes),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 from typing import Any
 
 import torch
 
+from mmsynth.bench.machine import usable_cores
 from mmsynth.field.kernels import cpu
 
 _PACKAGES = (
@@ -36,8 +36,7 @@ def diagnose() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             versions[name] = None
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
-    compiled = cpu.is_compiled()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    compiled, cores = cpu.is_compiled(), usable_cores()
     advice = []
     if not compiled:
         advice.append("The CPU kernels are not compiled yet: the first fit does it, once, and says so.")

@@ -24,7 +24,7 @@ from mmsynth.bench.machine import identify
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.files import read_json, write_json
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.operations.output.progress import Progress
+from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene, keep_frames
 
@@ -81,22 +81,18 @@ def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -
     for job in jobs:
         scene_of(job.task())
     hashes = {path: scene_hash(load_scene(path)) for path in {job.scene for job in jobs}}
-    for done, job in enumerate(jobs):
-        if progress is not None:
-            progress(done, len(jobs))
+    counter = Counter(progress, len(jobs))
+    counter(0)
+    for job in jobs:
         # looked up when its turn comes: the code may have been edited since the bench began
         wanted = identity(job, hashes[job.scene])
-        path = out / "rows" / f"{job.name}-{_digest(wanted)}.json"
+        path = out / "rows" / f"{job.name}-{hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:12]}.json"
         if not path.is_file():
-            machine = {"cores": wanted["machine"]["cores"], "threads": wanted["machine"]["threads"]}
+            about = {"name": job.name, "seed": job.seed, "device": job.device} | {k: wanted["machine"][k] for k in ("cores", "threads")}
             result = run_job(job)
-            mean = mean_over_modalities(result["scores"])
-            write_json(
-                path, {"name": job.name, "seed": job.seed, "device": job.device, **machine, **result, "mean": mean, "identity": wanted}
-            )
+            write_json(path, {**about, **result, "mean": mean_over_modalities(result["scores"]), "identity": wanted})
         yield read_json(path)
-    if progress is not None:
-        progress(len(jobs), len(jobs))
+        counter(1)
 
 
 def run_job(job: Job) -> dict[str, Any]:
@@ -163,7 +159,7 @@ def code_hash() -> str:
     digest = hashlib.sha256()
     for part in _CODE:
         path = _PACKAGE / part
-        for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+        for source in sorted(path.rglob("*.py")) or [path]:
             digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -180,7 +176,3 @@ def _file_hash(path: Path) -> bytes:
         return hashlib.sha256(path.read_bytes()).digest()
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror}).") from error
-
-
-def _digest(value: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:12]

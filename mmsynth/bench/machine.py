@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-import time
+import timeit
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,7 +29,8 @@ def usable_cores() -> int:
 
 def identify() -> dict[str, Any]:
     """What the machine is and what runs on it, without measuring: ``cpu, flags, cores, threads, memory_gb, gpu, versions``."""
-    info = _cpuinfo()
+    info = _facts(Path("/proc/cpuinfo"))
+    versions = {"mmsynth": __version__, "python": platform.python_version()}
     return {
         "cpu": info.get("model name") or platform.processor() or platform.machine(),
         "flags": _flags(info),
@@ -38,13 +39,7 @@ def identify() -> dict[str, Any]:
         "memory_gb": round(_memory_bytes() / 1e9, 1),
         "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
         "system": platform.system(),
-        "versions": {
-            "mmsynth": __version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numba": numba.__version__,
-            "numpy": np.__version__,
-        },
+        "versions": versions | {module.__name__: module.__version__ for module in (torch, numba, np)},
     }
 
 
@@ -90,11 +85,9 @@ def peak_memory() -> int:
     Not ``ru_maxrss`` on Linux: a child inherits that from the process that started it, so that a small fit started by a large
     process would look large.
     """
-    status = Path("/proc/self/status")
-    if status.is_file():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+    status = _facts(Path("/proc/self/status"))
+    if "VmHWM" in status:
+        return int(status["VmHWM"].split()[0]) * 1024
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -113,13 +106,10 @@ def describe(machine: dict[str, Any]) -> str:
     )
 
 
-def _cpuinfo() -> dict[str, str]:
-    """The first processor in /proc/cpuinfo; empty on other systems."""
-    path = Path("/proc/cpuinfo")
-    if not path.is_file():
-        return {}
-    first = path.read_text().split("\n\n")[0]
-    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in first.splitlines())}
+def _facts(path: Path) -> dict[str, str]:
+    """The first paragraph of a file of /proc, lines of ``key: value``; empty on systems that have none."""
+    lines = path.read_text().split("\n\n")[0].splitlines() if path.is_file() else []
+    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
 
 
 def _flags(info: dict[str, str]) -> list[str]:
@@ -131,9 +121,7 @@ def _flags(info: dict[str, str]) -> list[str]:
 
 
 def _memory_bytes() -> int:
-    if not hasattr(os, "sysconf"):
-        return 0
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
 
 
 def _last_cache_bytes() -> int:
@@ -143,12 +131,7 @@ def _last_cache_bytes() -> int:
 
 def _best_seconds(work: Callable[[], Any]) -> float:
     work()
-    best = float("inf")
-    for _ in range(_REPEATS):
-        began = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - began)
-    return best
+    return min(timeit.repeat(work, number=1, repeat=_REPEATS))
 
 
 def _triad() -> float:
@@ -161,6 +144,5 @@ def _triad() -> float:
 
 def _gemm(size: int = 1024) -> float:
     """GFLOP/s of a float32 product of two ``size`` × ``size`` matrices."""
-    a, b = torch.rand(size, size), torch.rand(size, size)
-    out = torch.empty(size, size)
+    a, b, out = (torch.rand(size, size) for _ in range(3))
     return 2 * size**3 / _best_seconds(lambda: torch.mm(a, b, out=out)) / 1e9

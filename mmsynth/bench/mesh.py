@@ -12,11 +12,11 @@ from mmsynth.bench.fit import budget_name
 from mmsynth.bench.jobs import in_a_process
 from mmsynth.bench.machine import measure
 from mmsynth.bench.mesh_worker import METHODS
-from mmsynth.bench.output import Report, new_figure, write_report
-from mmsynth.bench.tables import Column, Table, lookup
+from mmsynth.bench.output import Report, line_panels, write_report
+from mmsynth.bench.tables import Column, Table, lookup, numbers
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
-from mmsynth.operations.output.progress import Progress
+from mmsynth.operations.output.progress import Counter, Progress
 
 RESOLUTIONS = (64, 128, 256, 512)
 
@@ -52,12 +52,12 @@ def bench_mesh(
         for run in runs for n in sorted(resolutions) for method in chosen
     ]  # fmt: skip
     results: dict[str, Any] = {"bench": "mesh", "machine": measure(), "rows": []}
-    for done, task in enumerate(tasks, 1):
+    counter = Counter(progress, len(tasks))
+    for task in tasks:
         found = in_a_process("mmsynth.bench.mesh_worker", task, f"{task['method']} at {task['resolution']}")
         results["rows"].append({**task, **fits[str(task["run"])], **found})
         report = write_report(results, [table_of(results["rows"])], plot(results["rows"]), out)
-        if progress is not None:
-            progress(done, len(tasks))
+        counter(1)
     return report
 
 
@@ -80,15 +80,11 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
         Column("seconds", "seconds", ".1f"),
         Column("cpu", "cpu_share", ".0%"),
         Column("memory [MB]", "peak_memory_bytes", ",.0f", 1e-6),
-        Column("faces", "mesh/faces", ",d"),
-        Column("pieces", "mesh/components", "d"),
-        Column("watertight", "mesh/watertight", "d"),
-        Column("Euler", "mesh/euler_number", "d"),
+        *numbers(",d", {"faces": "mesh/faces", "pieces": "mesh/components"}),
+        *numbers("d", {"watertight": "mesh/watertight", "Euler": "mesh/euler_number"}),
         Column("off zero [cells]", "mesh/residual/rms_cells", ".1e"),
-        Column("accuracy", "against/accuracy", ".6f"),
-        Column("completeness", "against/completeness", ".6f"),
-        Column("Chamfer", "against/chamfer", ".6f"),
-        *(Column(f"F at {distance}", f"against/f_score/{distance}", ".3f") for distance in f_scores),
+        *numbers(".6f", {name: f"against/{name.lower()}" for name in ("accuracy", "completeness", "Chamfer")}),
+        *numbers(".3f", {f"F at {distance}": f"against/f_score/{distance}" for distance in f_scores}),
         Column("normals", "against/normal_consistency", ".3f"),
     )
     note = (
@@ -100,17 +96,11 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 def plot(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Seconds, memory and, with a reference, Chamfer over resolution, both log; a line per fit and method."""
-    panels = [("seconds", "seconds", 1.0), ("peak_memory_bytes", "peak memory [MB]", 1e-6)]
-    if any(lookup(row, "against/chamfer") is not None for row in rows):
-        panels.append(("against/chamfer", "Chamfer distance [scene unit]", 1.0))
-    figure, axes = new_figure(len(panels))
-    lines = dict.fromkeys((row["run"], row["budget"], row["method"]) for row in rows)
-    for one, (path, label, scale) in zip(axes, panels, strict=True):
-        for run, budget, method in lines:
-            here = [row for row in rows if (row["run"], row["method"]) == (run, method) and lookup(row, path) is not None]
-            one.plot([r["resolution"] for r in here], [lookup(r, path) * scale for r in here], "o-", label=f"fit of {budget}: {method}")
-        one.set(xscale="log", yscale="log", xlabel="cells across the region", ylabel=label)
-        one.set_xticks(sorted({row["resolution"] for row in rows}), [str(n) for n in sorted({row["resolution"] for row in rows})])
-        one.minorticks_off()
-        one.legend(frameon=False, fontsize=7)
-    return figure
+    panels: dict[str, dict[str, dict[float, float | None]]] = {}
+    for row in rows:
+        memory, chamfer = row["peak_memory_bytes"] * 1e-6, lookup(row, "against/chamfer")
+        for label, y in (("seconds", row["seconds"]), ("peak memory [MB]", memory), ("Chamfer distance [scene unit]", chamfer)):
+            lines = panels.setdefault(label, {})
+            lines.setdefault(f"{row['run']}, fit of {row['budget']}: {row['method']}", {})[row["resolution"]] = y
+    ticks = {n: str(n) for n in sorted({row["resolution"] for row in rows})}
+    return line_panels(panels, "cells across the region", ticks, yscale="log")

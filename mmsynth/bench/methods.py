@@ -15,13 +15,23 @@ import cv2
 import numpy as np
 
 from mmsynth.bench.machine import use_threads
-from mmsynth.bench.tables import Column, Table
+from mmsynth.bench.tables import Column, Table, numbers
 from mmsynth.errors import InputError
-from mmsynth.operations.output.progress import Progress
+from mmsynth.operations.output.progress import Counter, Progress
 
 REPEATS = 7
-
-
+COLUMNS = (
+    *numbers("", {"problem": "problem", "method": "method"}),
+    Column("ns", "ns", ".1f"),
+    *numbers(".5g", {"found": "found", "closed form": "truth"}),
+    Column("deviations", "deviations", ".1f"),
+    *numbers(".1e", {"error": "error", "worst": "worst", "expected error": "expected_error"}),
+    Column("noise gain", "noise_gain", ".2f"),
+    *numbers(".1%", {"gain": "gain", "read": "read", "read, at best": "read_at_best", "PRNU": "prnu"}),
+    Column("in", "unit"),
+    *numbers(".2%", {"wrong": "wrong", "masked": "missing"}),
+    Column("PSNR [dB]", "psnr", ".2f"),
+)
 Family = Callable[..., list[Any]]
 """A function whose name and docstring are those of a table, and which makes its methods."""
 
@@ -35,7 +45,6 @@ class Method:
         count: elements of a run; times are per element.
     """
 
-    family: str
     problem: str
     name: str
     run: Callable[[], Any]
@@ -45,7 +54,7 @@ class Method:
 
 
 def chosen_families(families: Sequence[Family], bench: str, only: Sequence[str] | None) -> dict[str, Family]:
-    """Families by name: all, or those named in ``only``.
+    """By name: all, or those named in ``only``.
 
     Raises:
         InputError: an unknown name.
@@ -57,28 +66,21 @@ def chosen_families(families: Sequence[Family], bench: str, only: Sequence[str] 
     return {name: family for name, family in known.items() if only is None or name in only}
 
 
-def measured_methods(methods: Sequence[Method], repeats: int, progress: Progress | None, threads: int = 1) -> list[dict[str, Any]]:
-    """One row per method."""
-    rows, groups = [], _groups(methods)
-    before = cv2.getNumThreads()
+def measured(families: Mapping[str, Sequence[Method]], repeats: int, progress: Progress | None, threads: int = 1) -> list[dict[str, Any]]:
+    """One row per method; ``families``: their methods, by name."""
+    problems = list(dict.fromkeys((family, method.problem) for family, methods in families.items() for method in methods))
+    counter = Counter(progress, len(problems))
+    rows, before = [], cv2.getNumThreads()
     try:
         cv2.setNumThreads(threads)
         with use_threads(threads):
-            for done, group in enumerate(groups, 1):
-                rows += _measured(group, repeats)
-                if progress is not None:
-                    progress(done, len(groups))
+            for family, problem in problems:
+                found = _measured([method for method in families[family] if method.problem == problem], repeats)
+                rows += [{"family": family, **row} for row in found]
+                counter(1)
     finally:
         cv2.setNumThreads(before)
     return rows
-
-
-def _groups(methods: Sequence[Method]) -> list[list[Method]]:
-    """Methods of one problem."""
-    groups: dict[tuple[str, str], list[Method]] = {}
-    for method in methods:
-        groups.setdefault((method.family, method.problem), []).append(method)
-    return list(groups.values())
 
 
 def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
@@ -94,7 +96,7 @@ def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
             worked.append(time.process_time() - busy)
     return [
         {
-            "family": method.family, "problem": method.problem, "method": method.name, "unit": method.unit,
+            "problem": method.problem, "method": method.name, "unit": method.unit,
             "ns": statistics.median(taken) / method.count * 1e9, "cpu_ns": statistics.median(worked) / method.count * 1e9, **found,
         }
         for method, taken, worked, found in zip(group, times, work, judged, strict=True)
@@ -108,12 +110,9 @@ def typical(error: np.ndarray) -> dict[str, float]:
 
 
 def family_tables(
-    rows: Sequence[Mapping[str, Any]],
-    columns: Sequence[Column],
-    families: Sequence[Family],
-    more: Mapping[str, str] | None = None,
+    rows: Sequence[Mapping[str, Any]], families: Sequence[Family], columns: Sequence[Column] = COLUMNS, note: str = ""
 ) -> list[Table]:
-    """A table per family that has rows; its note is the first line of its function's docstring, and what ``more`` adds."""
-    notes = {f.__name__.replace("_", " "): (f.__doc__ or "").split("\n")[0] + (more or {}).get(f.__name__, "") for f in families}
+    """A table per family that has rows; its note is the first paragraph of its function's docstring, and ``note``."""
+    notes = {f.__name__.replace("_", " "): " ".join((f.__doc__ or "").split("\n\n")[0].split()) + note for f in families}
     here = dict.fromkeys(row["family"] for row in rows)
     return [Table(name.capitalize(), columns, [row for row in rows if row["family"] == name], notes[name]) for name in here]

@@ -1,14 +1,14 @@
 """``mmsynth bench numerics``: speed against error of what is computed approximately, ours beside the usual ways.
 
-Each family compares methods on problems whose exact answer is known: by construction, by the forward model, or in float64. Speeds
-are medians of repeats in which the methods take turns, on one thread, per element. To add a method, add a ``Method`` to its family.
+Each family compares methods on problems whose exact answer is known: by construction, by the forward model, or in float64. To add a
+method, add a ``Method`` to its family.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,8 @@ import torch
 from torch import Tensor
 
 from mmsynth.bench.machine import measure
-from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_tables, measured_methods, typical
+from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_tables, measured, typical
 from mmsynth.bench.output import Report, scatter_panels, write_report
-from mmsynth.bench.tables import Column, Table
 from mmsynth.field.kernels import reference
 from mmsynth.operations.output.progress import Progress
 from mmsynth.sensors import lenses
@@ -43,61 +42,56 @@ _POL, _POL_ANGLES = np.array([[2, 1], [3, 0]]), (0.0, 45.0, 90.0, 135.0)
 
 
 def undistortion() -> list[Method]:
-    """Pixels to rays of a lens, judged by OpenCV's forward model [px at f = 1000]. Missing: has no ray, or the method gave none."""
-    methods = []
-    for k1, k2, degrees in ((-0.1, 0.02, 60.0), (-0.28, 0.07, 95.0), (0.4, 0.0, 95.0), (-0.35, 0.0, 120.0)):
-        focal = 160 / math.tan(math.radians(degrees / 2))
-        camera = Camera(321, 241, focal, focal, 160.0, 120.0, (k1, k2, 1e-3, -5e-4))
-        pixels = np.stack(np.meshgrid(np.arange(321.0), np.arange(241.0)), -1).reshape(-1, 2)
-        matrix, k = camera.matrix, camera.coefficients
-        plane = torch.from_numpy((pixels - [160.0, 120.0]) / focal)
+    """Pixels to rays of a lens, judged by OpenCV's forward model [px at f = 1000]. Missing: has no ray, or the method gave none.
+    Error: the median. Wrong: by more than 0.1 px, or behind the fold."""
+    cases = ((-0.1, 0.02, 60.0), (-0.28, 0.07, 95.0), (0.4, 0.0, 95.0), (-0.35, 0.0, 120.0))
+    return [method for case in cases for method in _undistortion(*case)]
 
-        def opencv(iterations: int, pixels: np.ndarray = pixels, matrix: np.ndarray = matrix, k: np.ndarray = k) -> np.ndarray:
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, iterations, 1e-12)
-            return cv2.undistortPoints(pixels[:, None], matrix, k, criteria=criteria)[:, 0]
 
-        def by_kornia(plane: Tensor = plane, k: np.ndarray = k) -> np.ndarray:
-            return kornia.geometry.calibration.undistort_points(plane[None], torch.eye(3).double()[None], torch.from_numpy(k)[None])[
-                0
-            ].numpy()
+def _undistortion(k1: float, k2: float, degrees: float) -> list[Method]:
+    focal = 160 / math.tan(math.radians(degrees / 2))
+    camera = Camera(321, 241, focal, focal, 160.0, 120.0, (k1, k2, 1e-3, -5e-4))
+    pixels = np.stack(np.meshgrid(np.arange(321.0), np.arange(241.0)), -1).reshape(-1, 2)
+    matrix, k, lens = camera.matrix, camera.coefficients, torch.from_numpy(camera.coefficients)
+    plane = torch.from_numpy((pixels - [160.0, 120.0]) / focal)
 
-        def newton(plane: Tensor = plane, k: np.ndarray = k) -> np.ndarray:
-            point, lens = plane.clone(), torch.from_numpy(k)
-            for _ in range(10):
-                step, singular = torch.linalg.solve_ex(
-                    lenses.distort_jacobian(point, lens), (plane - lenses.distort(point, lens))[..., None]
-                )
-                point = torch.where((singular == 0)[:, None], point + step[..., 0], point)
-            return point.numpy()
+    def opencv(iterations: int) -> np.ndarray:
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, iterations, 1e-12)
+        return cv2.undistortPoints(pixels[:, None], matrix, k, criteria=criteria)[:, 0]
 
-        def ours(pixels: np.ndarray = pixels, camera: Camera = camera) -> np.ndarray:
-            directions, valid = unproject(pixels, camera)
-            return np.where(valid[:, None], directions[:, :2] / directions[:, 2:], np.nan)
+    def by_kornia() -> np.ndarray:
+        return kornia.geometry.calibration.undistort_points(plane[None], torch.eye(3).double()[None], lens[None])[0].numpy()
 
-        def judge(ideal: np.ndarray, pixels: np.ndarray = pixels, matrix: np.ndarray = matrix, k: np.ndarray = k) -> dict[str, float]:
-            given = np.isfinite(ideal).all(-1)
-            points = np.concatenate([ideal[given], np.ones((given.sum(), 1))], 1)
-            back = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
-            error = np.nan_to_num(np.linalg.norm(back - pixels[given], axis=1) * 1000 / matrix[0, 0], nan=np.inf)
-            # beyond the fold a residual may be small by chance, on the wrong branch
-            limit = float(lenses.fold_radius(torch.from_numpy(k)))
-            wrong = (error > 0.1) | (np.linalg.norm(ideal[given], axis=1) > limit)
-            return {
-                "error": float(np.median(error)), "worst": float(error.max()), "wrong": float(wrong.mean()),
-                "missing": float(1 - given.mean()),
-            }  # fmt: skip
+    def newton() -> np.ndarray:
+        point = plane.clone()
+        for _ in range(10):
+            off = (plane - lenses.distort(point, lens))[..., None]
+            step, singular = torch.linalg.solve_ex(lenses.distort_jacobian(point, lens), off)
+            point = torch.where((singular == 0)[:, None], point + step[..., 0], point)
+        return point.numpy()
 
-        problem = f"{degrees:.0f}°, k1 = {k1:g}, k2 = {k2:g}"
-        for name, run in (
-            ("OpenCV, 5 iterations", functools.partial(opencv, 5)),
-            ("OpenCV, 20 iterations", functools.partial(opencv, 20)),
-            ("OpenCV, 100 iterations", functools.partial(opencv, 100)),
-            ("kornia, 5 iterations", by_kornia),
-            ("Newton, 10 steps, unchecked", newton),
-            ("mmsynth", ours),
-        ):
-            methods.append(Method("undistortion", problem, name, run, judge, len(pixels), "px"))
-    return methods
+    def ours() -> np.ndarray:
+        directions, valid = unproject(pixels, camera)
+        return np.where(valid[:, None], directions[:, :2] / directions[:, 2:], np.nan)
+
+    def judge(ideal: np.ndarray) -> dict[str, float]:
+        given = np.isfinite(ideal).all(-1)
+        points = np.concatenate([ideal[given], np.ones((given.sum(), 1))], 1)
+        back = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, k)[0][:, 0]
+        error = np.nan_to_num(np.linalg.norm(back - pixels[given], axis=1) * 1000 / matrix[0, 0], nan=np.inf)
+        # beyond the fold a residual may be small by chance, on the wrong branch
+        wrong = (error > 0.1) | (np.linalg.norm(ideal[given], axis=1) > float(lenses.fold_radius(lens)))
+        shares = {"wrong": float(wrong.mean()), "missing": float(1 - given.mean())}
+        return {"error": float(np.median(error)), "worst": float(error.max()), **shares}
+
+    problem = f"{degrees:.0f}°, k1 = {k1:g}, k2 = {k2:g}"
+    ways: dict[str, Callable[[], np.ndarray]] = {
+        **{f"OpenCV, {n} iterations": functools.partial(opencv, n) for n in (5, 20, 100)},
+        "kornia, 5 iterations": by_kornia,
+        "Newton, 10 steps, unchecked": newton,
+        "mmsynth": ours,
+    }
+    return [Method(problem, name, run, judge, len(pixels), "px") for name, run in ways.items()]
 
 
 def opacity() -> list[Method]:
@@ -112,35 +106,35 @@ def opacity() -> list[Method]:
         }
         for problem, line in lines.items():
             sdf = line + 0.01 / s * torch.rand(64, len(line), generator=random)
-            offsets = torch.arange(0, sdf.numel() + 1, len(line))
-
-            def ours(dtype: torch.dtype, sdf: Tensor = sdf, offsets: Tensor = offsets, s: float = s) -> Tensor:
-                weights = reference.section_weights(sdf.to(dtype).reshape(-1), s, offsets)[0]
-                return weights.reshape(len(sdf), -1).sum(1)
-
-            def neus(dtype: torch.dtype, sdf: Tensor = sdf, s: float = s) -> Tensor:
-                f = torch.sigmoid(sdf.to(dtype) * s)
-                alpha = ((f[:, :-1] - f[:, 1:] + 1e-5) / (f[:, :-1] + 1e-5)).clamp(0, 1)
-                through = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha + 1e-7], 1), 1)
-                return (alpha * through[:, :-1]).sum(1)
-
-            exact = 1 - torch.exp(
-                -torch.relu(
-                    torch.nn.functional.softplus(-s * sdf.double()[:, 1:]) - torch.nn.functional.softplus(-s * sdf.double()[:, :-1])
-                ).sum(1)
-            )
-
-            def judge(found: Tensor, exact: Tensor = exact) -> dict[str, float]:
-                return typical((found.double() - exact).abs().numpy())
-
-            for name, run in (
-                ("NeuS, 1e-5, float32", functools.partial(neus, torch.float32)),
-                ("NeuS, 1e-5, float16", functools.partial(neus, torch.float16)),
-                ("mmsynth, float32", functools.partial(ours, torch.float32)),
-                ("mmsynth, float64", functools.partial(ours, torch.float64)),
-            ):
-                methods.append(Method("opacity", f"{problem}, s = {s:g}", name, run, judge, sdf.numel(), "1"))
+            methods += _opacity(f"{problem}, s = {s:g}", sdf, s)
     return methods
+
+
+def _opacity(problem: str, sdf: Tensor, s: float) -> list[Method]:
+    offsets = torch.arange(0, sdf.numel() + 1, sdf.shape[1])
+    density = torch.nn.functional.softplus(-s * sdf.double())
+    exact = 1 - torch.exp(-torch.relu(density[:, 1:] - density[:, :-1]).sum(1))
+
+    def ours(dtype: torch.dtype) -> Tensor:
+        return reference.section_weights(sdf.to(dtype).reshape(-1), s, offsets)[0].reshape(len(sdf), -1).sum(1)
+
+    def neus(dtype: torch.dtype) -> Tensor:
+        f = torch.sigmoid(sdf.to(dtype) * s)
+        alpha = ((f[:, :-1] - f[:, 1:] + 1e-5) / (f[:, :-1] + 1e-5)).clamp(0, 1)
+        through = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha + 1e-7], 1), 1)
+        return (alpha * through[:, :-1]).sum(1)
+
+    judge = lambda found: typical((found.double() - exact).abs().numpy())
+    kinds = [("NeuS, 1e-5, ", neus, (torch.float32, torch.float16)), ("mmsynth, ", ours, (torch.float32, torch.float64))]
+    return [
+        Method(problem, f"{name}{_bare(dtype)}", functools.partial(way, dtype), judge, sdf.numel(), "1")
+        for name, way, dtypes in kinds
+        for dtype in dtypes
+    ]
+
+
+def _bare(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
 
 
 def normals() -> list[Method]:
@@ -163,35 +157,37 @@ def normals() -> list[Method]:
         angle = torch.atan2(torch.linalg.cross(found, outward).norm(dim=1), (found * outward).sum(1))
         return typical(torch.rad2deg(angle).numpy())
 
-    methods = []
-    for epsilon in (1 / 64, 1 / 256, 1 / 1024, 1 / 4096):
-        for kind, way in (("4 taps", four_taps), ("6 taps", central)):
-            for dtype in (torch.float32, torch.float16, torch.bfloat16):
-                name = f"{kind}, {str(dtype).removeprefix('torch.')}" + (
-                    " (mmsynth)" if kind == "4 taps" and dtype == torch.float32 else ""
-                )
-                methods.append(
-                    Method("normals", f"step {epsilon:.2g}", name, functools.partial(way, epsilon, dtype), judge, len(points), "°")
-                )
-    return methods
+    return [
+        Method(
+            f"step {epsilon:.2g}",
+            f"{kind}, {_bare(dtype)}" + (" (mmsynth)" if way is four_taps and dtype == torch.float32 else ""),
+            functools.partial(way, epsilon, dtype),
+            judge,
+            len(points),
+            "°",
+        )
+        for epsilon in (1 / 64, 1 / 256, 1 / 1024, 1 / 4096)
+        for kind, way in (("4 taps", four_taps), ("6 taps", central))
+        for dtype in (torch.float32, torch.float16, torch.bfloat16)
+    ]
 
 
 def angles() -> list[Method]:
     """The angle between two unit vectors, in float32."""
     generator = torch.Generator().manual_seed(0)
-    a = torch.nn.functional.normalize(torch.randn(20000, 3, generator=generator, dtype=torch.float64), dim=1)
-    aside = torch.nn.functional.normalize(torch.linalg.cross(a, torch.randn(20000, 3, generator=generator, dtype=torch.float64)), dim=1)
+    draw = lambda: torch.randn(20000, 3, generator=generator, dtype=torch.float64)
+    a = torch.nn.functional.normalize(draw(), dim=1)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(a, draw()), dim=1)
+    ways: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+        "acos, clamped by 1e-6": lambda x, y: torch.acos((x * y).sum(1).clamp(-1 + 1e-6, 1 - 1e-6)),
+        "atan2 (mmsynth)": lambda x, y: torch.atan2(torch.linalg.cross(x, y).norm(dim=1), (x * y).sum(1)),
+    }
     methods = []
     for size in (1e-5, 1e-3, 0.5, math.pi - 1e-4):
         b = math.cos(size) * a + math.sin(size) * aside
-        one, other = a.float(), b.float()
-        ways: tuple[tuple[str, Callable[[Tensor, Tensor], Tensor]], ...] = (
-            ("acos, clamped by 1e-6", lambda x, y: torch.acos((x * y).sum(1).clamp(-1 + 1e-6, 1 - 1e-6))),
-            ("atan2 (mmsynth)", lambda x, y: torch.atan2(torch.linalg.cross(x, y).norm(dim=1), (x * y).sum(1))),
-        )
-        for name, way in ways:
-            judge = lambda found, size=size: typical(np.degrees((found.double() - size).abs().numpy()))
-            methods.append(Method("angles", f"{size:.5g} rad", name, functools.partial(way, one, other), judge, len(a), "°"))
+        judge = lambda found, size=size: typical(np.degrees((found.double() - size).abs().numpy()))
+        for name, way in ways.items():
+            methods.append(Method(f"{size:.5g} rad", name, functools.partial(way, a.float(), b.float()), judge, len(a), "°"))
     return methods
 
 
@@ -218,14 +214,12 @@ def demosaicking() -> list[Method]:
         error = np.abs(np.asarray(found, dtype=np.float64) - image.numpy())[:, 4:-4, 4:-4]
         return typical(error) | {"psnr": -20 * math.log10(float(np.sqrt(np.mean(error**2))))}
 
-    by_opencv = lambda code: np.moveaxis(cv2.demosaicing(codes, code) / 65535.0, -1, 0)
-    ways: list[tuple[str, Callable[[], Any]]] = [
-        ("mmsynth, normalised convolution", lambda: demosaic(raw, _RGGB)),
-        ("mmsynth, edge-aware (OpenCV's)", lambda: demosaic_edge_aware(raw.numpy(), _RGGB)),
-        ("OpenCV, bilinear", lambda: by_opencv(cv2.COLOR_BayerBG2RGB)),
-        ("kornia, bilinear", lambda: kornia.color.raw_to_rgb(raw[None, None], kornia.color.CFA.BG)[0]),
-    ]
-    methods = [Method("demosaicking", "Bayer", name, run, judge, raw.numel(), "1") for name, run in ways]
+    of_colours: dict[str, Callable[[], Any]] = {
+        "mmsynth, normalised convolution": lambda: demosaic(raw, _RGGB),
+        "mmsynth, edge-aware (OpenCV's)": lambda: demosaic_edge_aware(raw.numpy(), _RGGB),
+        "OpenCV, bilinear": lambda: np.moveaxis(cv2.demosaicing(codes, cv2.COLOR_BayerBG2RGB) / 65535.0, -1, 0),
+        "kornia, bilinear": lambda: kornia.color.raw_to_rgb(raw[None, None], kornia.color.CFA.BG)[0],
+    }
 
     light = torch.from_numpy(_picture(240, 320, 1))[0]
     unpolarized = torch.stack([2 * light, 0 * light, 0 * light], -1)
@@ -238,12 +232,14 @@ def demosaicking() -> list[Method]:
     def false_degree(found: Tensor) -> dict[str, float]:
         return typical(degree_of_linear_polarization(intensities_to_stokes(found, _POL_ANGLES)).numpy()[2:-2, 2:-2])
 
-    for name, run in (
-        ("mmsynth, normalised convolution", lambda: demosaic(frame, _POL).movedim(0, -1)),
-        ("superpixels of 2 x 2", superpixels),
-    ):
-        methods.append(Method("demosaicking", "false DoLP of unpolarized light", name, run, false_degree, frame.numel(), "1"))
-    return methods
+    of_degrees: dict[str, Callable[[], Any]] = {
+        "mmsynth, normalised convolution": lambda: demosaic(frame, _POL).movedim(0, -1),
+        "superpixels of 2 x 2": superpixels,
+    }
+    return [
+        *(Method("Bayer", name, run, judge, raw.numel(), "1") for name, run in of_colours.items()),
+        *(Method("false DoLP of unpolarized light", name, run, false_degree, frame.numel(), "1") for name, run in of_degrees.items()),
+    ]
 
 
 def resampling() -> list[Method]:
@@ -259,17 +255,13 @@ def resampling() -> list[Method]:
     def judge(found: Tensor) -> dict[str, float]:
         return typical(aolp_difference(found, truth).abs().numpy()[4:-4, 4:-4])
 
-    methods = []
-    for mode in ("bilinear", "bicubic"):
-        for name, run in (
-            ("of angles", functools.partial(lambda mode: resize(aolp[None], mode)[0], mode)),
-            (
-                "of Stokes vectors (mmsynth)",
-                functools.partial(lambda mode: angle_of_linear_polarization(resize(stokes.movedim(-1, 0), mode).movedim(0, -1)), mode),
-            ),
-        ):
-            methods.append(Method("resampling", mode, name, run, judge, truth.numel(), "°"))
-    return methods
+    of_angles = lambda mode: resize(aolp[None], mode)[0]
+    of_stokes = lambda mode: angle_of_linear_polarization(resize(stokes.movedim(-1, 0), mode).movedim(0, -1))
+    return [
+        Method(mode, name, functools.partial(way, mode), judge, truth.numel(), "°")
+        for mode in ("bilinear", "bicubic")
+        for name, way in (("of angles", of_angles), ("of Stokes vectors (mmsynth)", of_stokes))
+    ]
 
 
 FAMILIES = (undistortion, opacity, normals, angles, demosaicking, resampling)
@@ -284,24 +276,8 @@ def bench_numerics(out: Path, only: Sequence[str] | None = None, repeats: int = 
     Raises:
         InputError: an unknown name, or ``out`` cannot be written.
     """
-    families = chosen_families(FAMILIES, "numerics", only)
-    rows = measured_methods([m for family in families.values() for m in family()], repeats, progress)
+    families = {name: family() for name, family in chosen_families(FAMILIES, "numerics", only).items()}
+    rows = measured(families, repeats, progress)
     figure = scatter_panels(rows, ("ns", "ns per element"), ("worst", "worst error [{unit}]"), "{method}", ours="mmsynth")
     results = {"bench": "numerics", "machine": measure(), "rows": rows, "repeats": repeats}
-    return write_report(results, tables_of(rows), figure, out)
-
-
-def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """A table per family."""
-    columns = (
-        Column("problem", "problem"),
-        Column("method", "method"),
-        Column("ns", "ns", ".1f"),
-        Column("error", "error", ".1e"),
-        Column("worst", "worst", ".1e"),
-        Column("in", "unit"),
-        Column("wrong", "wrong", ".2%"),
-        Column("masked", "missing", ".2%"),
-        Column("PSNR [dB]", "psnr", ".2f"),
-    )
-    return family_tables(rows, columns, FAMILIES, {"undistortion": " Error: the median. Wrong: by more than 0.1 px, or behind the fold."})
+    return write_report(results, family_tables(rows, FAMILIES), figure, out)

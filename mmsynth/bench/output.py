@@ -52,6 +52,28 @@ def new_figure(panels: int, height: float = 4.2) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
+def line_panels(
+    panels: Mapping[str, Mapping[str, Mapping[float, float | None]]], x: str, ticks: Mapping[float, str], **axis: Any
+) -> Figure:
+    """Lines over log x: label of a panel's y axis → name of a line → x → y. A panel without any y is left out, as is a y that is None.
+
+    Args:
+        x: label of the axis. ticks: its marks. axis: of every panel, as for ``Axes.set``.
+    """
+    panels = {label: lines for label, lines in panels.items() if any(y is not None for line in lines.values() for y in line.values())}
+    figure, axes = new_figure(len(panels))
+    for one, (label, lines) in zip(axes, panels.items(), strict=True):
+        for name, line in lines.items():
+            known = {x: y for x, y in line.items() if y is not None}
+            style: Any = {"color": "black", "linewidth": 2} if name == "mean" else {}
+            one.plot(list(known), list(known.values()), "o-", label=name, **style)
+        one.set(xscale="log", xlabel=x, ylabel=label, **axis)
+        one.set_xticks(list(ticks), list(ticks.values()))
+        one.minorticks_off()
+        one.legend(frameon=False, fontsize=7)
+    return figure
+
+
 def scatter_panels(rows: Sequence[Mapping[str, Any]], x: tuple[str, str], y: tuple[str, str], label: str, ours: str = "") -> Figure:
     """Error over speed, both log, a panel per family of methods.
 

@@ -11,7 +11,7 @@ import copy
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from mmsynth.bench.machine import measure, use_threads
-from mmsynth.bench.methods import Method, chosen_families, family_tables, measured_methods
+from mmsynth.bench.methods import Method, chosen_families, family_tables, measured
 from mmsynth.bench.output import Report, scatter_panels, write_report
-from mmsynth.bench.tables import Column, Table
+from mmsynth.bench.tables import Column, numbers
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import TILE, Field
@@ -52,8 +52,9 @@ class Rays:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def tile(self, start: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
-        return self.origins[start : start + size], self.directions[start : start + size], self.camera_x[start : start + size]
+    def tiles(self, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """By at most ``size`` rays: their origins, directions and camera_x."""
+        return zip(self.origins.split(size), self.directions.split(size), self.camera_x.split(size), strict=True)
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,7 @@ def _exact(field: Field, rays: Rays, sampling: Sampling) -> tuple[Outputs, float
     """By single operations, and not as many samples a ray as the kernel has room for but as many as it takes."""
     surface, parts, samples = field.surface, [], 0
     sdf = lambda x: surface(x, sampling.active_surface)
-    for start in range(0, len(rays), _FINE_RAYS):
-        origins, directions, camera_x = rays.tile(start, _FINE_RAYS)
+    for origins, directions, camera_x in rays.tiles(_FINE_RAYS):
         near, far = rendering.interval(surface, origins, directions)
         marched = kernels.Rays(origins, directions, near, far, torch.full_like(near, 0.5))
         taken = reference.march(sdf, marched, field.occupancy.states, surface.grid.extent, sampling, _FINE_MOST)
@@ -154,22 +154,15 @@ def _joined(parts: Sequence[Outputs]) -> Outputs:
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 
-def _with(field: Field, sampling: Sampling) -> Field:
-    """The same field, sampled otherwise; its tensors are shared."""
-    other = copy.copy(field)
-    other.sampling = sampling
-    return other
-
-
 # --- rendering and judging
 
 
 def render(bed: Bed, way: Way) -> Outputs:
     """All rays, the way an operation has them rendered."""
-    field = _with(bed.field, way.sampling)
+    field = copy.copy(bed.field)  # its tensors are shared
+    field.sampling = way.sampling
     with use_threads(way.threads):
-        starts = range(0, len(bed.rays), way.tile)
-        return _joined([field.render_rays(*bed.rays.tile(start, way.tile), way.modalities, way.geometry) for start in starts])
+        return _joined([field.render_rays(*tile, way.modalities, way.geometry) for tile in bed.rays.tiles(way.tile)])
 
 
 def difference(found: Outputs, truth: Outputs, modalities: Sequence[str]) -> dict[str, float]:
@@ -202,8 +195,7 @@ def judge(bed: Bed, way: Way, found: Outputs) -> dict[str, float]:
 @torch.no_grad()
 def _samples(bed: Bed, way: Way) -> float:
     field, total = bed.field, 0
-    for start in range(0, len(bed.rays), TILE):
-        origins, directions, _ = bed.rays.tile(start, TILE)
+    for origins, directions, _ in bed.rays.tiles(TILE):
         middle = torch.full((len(origins),), 0.5)
         total += int(rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, way.sampling).samples)
     return total / len(bed.rays)
@@ -212,61 +204,52 @@ def _samples(bed: Bed, way: Way) -> float:
 # --- families
 
 
+def _ways(bed: Bed, variants: Mapping[str, Mapping[str, Any]]) -> list[Way]:
+    """For one modality and for all, one of each name, which differs from the field's own way by some figures."""
+    own = {"sampling": bed.field.sampling}
+    return [Way(problem, name, names, **{**own, **change}) for problem, names in bed.sets.items() for name, change in variants.items()]
+
+
+def _values(sampling: Sampling, key: str, values: Sequence[float]) -> dict[str, dict[str, Sampling]]:
+    """Samplings with these values of a figure, and with its own."""
+    own = getattr(sampling, key)
+    return {f"{key} {v:g}{_own(v == own)}": {"sampling": sampling._replace(**{key: v})} for v in sorted({*values, own})}
+
+
+def _own(yes: bool) -> str:
+    return " (the field's)" if yes else ""
+
+
 def termination(bed: Bed) -> list[Way]:
     """The optical depth at which a ray ends."""
-    s = bed.field.sampling
-    values = sorted({1.0, 2.0, 3.0, 5.0, 8.0, s.max_optical_depth})
-    return [
-        Way(problem, f"max_optical_depth {v:g}{_own(v == s.max_optical_depth)}", names, s._replace(max_optical_depth=v))
-        for problem, names in bed.sets.items()
-        for v in values
-    ]
+    return _ways(bed, _values(bed.field.sampling, "max_optical_depth", (1.0, 2.0, 3.0, 5.0, 8.0)))
 
 
 def steps(bed: Bed) -> list[Way]:
     """How a ray is sampled: the step at the surface, the stride towards it, and how much a section weighs that has its own appearance."""
     s = bed.field.sampling
-    variants: list[tuple[str, dict[str, float]]] = [(f"step x {v:g}{_own(v == 1.0)}", {"step": v * s.step}) for v in (0.5, 1.0, 2.0, 4.0)]
-    for name, values in (("sphere_step_factor", (0.4, 0.7, 0.9)), ("min_section_weight", (0.0, 1e-2, 5e-2))):
-        own = getattr(s, name)
-        variants += [(f"{name} {v:g}{_own(v == own)}", {name: v}) for v in sorted({*values, own})]
-    return [
-        Way(problem, name, names, s._replace(**change))  # type: ignore[arg-type]
-        for problem, names in bed.sets.items()
-        for name, change in variants
-    ]
+    lengths = {f"step x {v:g}{_own(v == 1.0)}": {"sampling": s._replace(step=v * s.step)} for v in (0.5, 1.0, 2.0, 4.0)}
+    strides, weights = _values(s, "sphere_step_factor", (0.4, 0.7, 0.9)), _values(s, "min_section_weight", (0.0, 1e-2, 5e-2))
+    return _ways(bed, lengths | strides | weights)
 
 
 def asked(bed: Bed) -> list[Way]:
     """What is asked for: each modality alone and all of them, with normals and without, and the surface alone; depth comes with all."""
     s, names = bed.field.sampling, list(bed.field.sensors)
-    sets = {name: [name] for name in names} | bed.sets
-    light = [
-        Way("all rays", f"{name}{', normals' if shape else ''}", chosen, s, shape)
-        for name, chosen in sets.items()
-        for shape in (False, True)
-    ]
-    return [*light, Way("all rays", "depth", [], s), Way("all rays", "depth, normals", [], s, True)]
+    sets = {name: [name] for name in names} | bed.sets | {"depth": []}
+    return [Way("all rays", f"{name}{', normals' * shape}", chosen, s, shape) for name, chosen in sets.items() for shape in (False, True)]
 
 
 def tiles(bed: Bed) -> list[Way]:
     """Rays per tile."""
-    return [
-        Way(problem, f"{size} rays{_own(size == TILE)}", names, bed.field.sampling, tile=size)
-        for problem, names in bed.sets.items()
-        for size in (1024, 4096, 8192, 16384, 65536)
-    ]
+    return _ways(bed, {f"{size} rays{_own(size == TILE)}": {"tile": size} for size in (1024, 4096, 8192, 16384, 65536)})
 
 
 def threads(bed: Bed) -> list[Way]:
     """Threads, from one to as many as numba was started with, by doubling."""
     most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     counts = sorted({*(2**i for i in range(most.bit_length()) if 2**i <= most), most})
-    return [Way(p, f"{n} threads", names, bed.field.sampling, threads=n) for p, names in bed.sets.items() for n in counts]
-
-
-def _own(yes: bool) -> str:
-    return " (the field's)" if yes else ""
+    return _ways(bed, {f"{n} threads": {"threads": n} for n in counts})
 
 
 FAMILIES = (termination, steps, asked, tiles, threads)
@@ -296,8 +279,8 @@ def bench_render(
         machine = measure()
         rays = rays_of(field, scene)
         bed = Bed(field, rays, truth_of(field, rays))
-        methods = [_method(bed, name, way) for name, family in families.items() for way in family(bed)]
-        rows = measured_methods(methods, repeats, progress, torch.get_num_threads())
+        methods = {name: [_method(bed, way) for way in family(bed)] for name, family in families.items()}
+        rows = measured(methods, repeats, progress, torch.get_num_threads())
     for row in rows:
         row["rays_per_s"] = 1e9 / row["ns"]
     results = {
@@ -310,22 +293,9 @@ def bench_render(
         "reference": fine(field.sampling)._asdict() | {"samples": bed.truth.samples, "doubt": bed.truth.doubt},
     }
     figure = scatter_panels(rows, ("rays_per_s", "rays/s"), ("error", "error of radiance [full scale]"), "{problem}: {method}")
-    return write_report(results, tables_of(results), figure, out)
-
-
-def _method(bed: Bed, family: str, way: Way) -> Method:
-    run, judged = functools.partial(render, bed, way), functools.partial(judge, bed, way)
-    return Method(family, way.problem, way.name, run, judged, len(bed.rays), "full scale")
-
-
-def tables_of(results: Mapping[str, Any]) -> list[Table]:
-    """A table per family."""
     columns = (
-        Column("of", "problem"),
-        Column("rendered", "method"),
-        Column("rays/s", "rays_per_s", ",.0f"),
-        Column("ns", "ns", ",.0f"),
-        Column("CPU ns", "cpu_ns", ",.0f"),
+        *numbers("", {"of": "problem", "rendered": "method"}),
+        *numbers(",.0f", {"rays/s": "rays_per_s", "ns": "ns", "CPU ns": "cpu_ns"}),
         Column("samples", "samples", ".1f"),
         Column("PSNR [dB]", "psnr", ".2f"),
         Column("error", "error", ".3%"),
@@ -334,10 +304,14 @@ def tables_of(results: Mapping[str, Any]) -> list[Table]:
         Column("missed", "missed", ".3%"),
         Column("normals [°]", "normal", ".2f"),
     )
-    fine, rows = results["reference"], results["rows"]
     note = (
-        f" {results['rays']:,} rays, the median of {results['repeats']} turns; CPU ns: of all threads. Error and worst: of radiance, of "
-        f"full scale, against {fine['samples']:.0f} samples a ray, which is {fine['doubt']:.3%} from half as many. Depth: median, "
-        "relative. Missed: rays of which one met the surface and one did not."
+        f" {len(rays):,} rays, the median of {repeats} turns; CPU ns: of all threads. Error and worst: of radiance, of full scale, against "
+        f"{bed.truth.samples:.0f} samples a ray, which is {bed.truth.doubt:.3%} from half as many. Depth: median, relative. Missed: rays "
+        "of which one met the surface and one did not."
     )
-    return family_tables(rows, columns, FAMILIES, {family.__name__: note for family in FAMILIES})
+    return write_report(results, family_tables(rows, FAMILIES, columns, note), figure, out)
+
+
+def _method(bed: Bed, way: Way) -> Method:
+    run, judged = functools.partial(render, bed, way), functools.partial(judge, bed, way)
+    return Method(way.problem, way.name, run, judged, len(bed.rays), "full scale")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import rich.table
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
 
 MISSING = "–"
 
@@ -25,7 +27,6 @@ class Column:
     scale: float = 1.0
 
     def cell(self, row: Mapping[str, Any]) -> str:
-        """The text of a row's value."""
         value = lookup(row, self.path)
         if isinstance(value, Mapping):
             spread = "" if value["spread"] is None else f" ± {value['spread'] * self.scale:{self.form.lstrip('+')}}"
@@ -33,6 +34,11 @@ class Column:
         if isinstance(value, (int, float)):
             return f"{value * self.scale if self.scale != 1.0 else value:{self.form}}"
         return MISSING if value is None else str(value)
+
+
+def numbers(form: str, paths: Mapping[str, str], scale: float = 1.0) -> tuple[Column, ...]:
+    """Columns of one format; ``paths``: by heading."""
+    return tuple(Column(heading, path, form, scale) for heading, path in paths.items())
 
 
 @dataclass(frozen=True)
@@ -69,23 +75,12 @@ def markdown(table: Table) -> str:
 
 def print_tables(tables: Sequence[Table]) -> None:
     """Print on the terminal, at their own width: a number cut off or broken over two lines is no number."""
-    from rich.console import Console
-
     console = Console(width=1000, highlight=False)
     for table in tables:
-        console.print(_rich(table))
-
-
-def _rich(table: Table) -> rich.table.Table:
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table as RichTable
-
-    columns = table.filled()
-    out = RichTable(title=escape(table.title), caption=escape(table.note) or None, box=box.SIMPLE, title_justify="left")
-    out.caption_justify = "left"
-    for column in columns:
-        out.add_column(escape(column.heading), justify="right" if column.form else "left")
-    for row in table.rows:
-        out.add_row(*(escape(column.cell(row)) for column in columns))
-    return out
+        shown = RichTable(title=escape(table.title), caption=escape(table.note) or None, box=box.SIMPLE, title_justify="left")
+        shown.caption_justify = "left"
+        for column in table.filled():
+            shown.add_column(escape(column.heading), justify="right" if column.form else "left")
+        for row in table.rows:
+            shown.add_row(*(escape(column.cell(row)) for column in table.filled()))
+        console.print(shown)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +20,12 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from mmsynth.bench.machine import measure
-from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_tables, measured_methods, typical
+from mmsynth.bench.methods import REPEATS, Method, chosen_families, family_tables, measured, typical
 from mmsynth.bench.output import Report, scatter_panels, write_report
-from mmsynth.bench.tables import Column, Table
+from mmsynth.field.field import Field
 from mmsynth.operations.output.progress import Progress
+from mmsynth.operations.simulation.frames import render_light
+from mmsynth.operations.simulation.plan import SimulatedSensor
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera, resized
 from mmsynth.sensors.noise import NoiseModel, record
@@ -31,9 +33,6 @@ from mmsynth.sensors.photon_transfer import photon_transfer, photon_transfer_of_
 from mmsynth.sensors.sensor_file import Response, SensorFile
 from mmsynth.sensors.spectral import MEASURED_ERROR, SMOOTH_NM, combine
 from mmsynth.sensors.twin import SensorTwin, aperture, blur
-
-if TYPE_CHECKING:
-    from mmsynth.field.field import Field
 
 _HEIGHT, _WIDTH, _LIGHT = 480, 640, 0.3
 _RGGB, _POL = np.array([[0, 1], [1, 2]]), np.array([[2, 1], [3, 0]])
@@ -46,12 +45,8 @@ _PLAIN = NoiseModel(bits=12, gain_dn_e=0.4, full_well_e=2e4)
 
 def _judged(found: float, truth: float, deviation: float) -> dict[str, float]:
     """A figure against its closed form; ``deviation``: one standard deviation of the figure, by the sample's size."""
-    return {
-        "found": found,
-        "truth": truth,
-        "error": abs(found - truth) / max(abs(truth), 1e-12),
-        "deviations": abs(found - truth) / deviation,
-    }
+    off = abs(found - truth)
+    return {"found": found, "truth": truth, "error": off / max(abs(truth), 1e-12), "deviations": off / deviation}
 
 
 def _variance(raw: Tensor, truth: float, overlap: float = 1.0) -> dict[str, float]:
@@ -68,7 +63,7 @@ def effects() -> list[Method]:
     def method(name: str, judge: Callable[[Tensor], dict[str, float]], **figures: float) -> Method:
         model = dataclasses.replace(_PLAIN, **figures)  # type: ignore[arg-type]
         run = functools.partial(record, light, model, [0], "bench")
-        return Method("effects", "noise of a flat field", name, run, judge, light.numel(), "of the closed form")
+        return Method("noise of a flat field", name, run, judge, light.numel(), "of the closed form")
 
     rows = lambda raw: raw[0].double().mean(1)
     neighbours = lambda raw: float(np.corrcoef(raw[0, :, 1:].ravel(), raw[0, :, :-1].ravel())[0, 1])
@@ -120,7 +115,7 @@ def optics() -> list[Method]:
     exact = lambda found, truth, unit=1e-6: _judged(float(found), truth, unit)
     corner = 1 - 0.3 * ((_WIDTH - 1) ** 2 + (_HEIGHT - 1) ** 2) / (_WIDTH**2 + _HEIGHT**2)
     analysed = 0.5 * (1 + 99 / 101 * 0.3)  # at 0 degrees
-    method = lambda name, run, judge: Method("optics", "light on the pixels", name, run, judge, size, "of the closed form")
+    method = lambda name, run, judge: Method("light on the pixels", name, run, judge, size, "of the closed form")
     return [
         method(f"PSF, σ = {sigma} px", lambda: blur(white, sigma), correlation),
         method("aperture, 2 x 2", lambda: aperture(ramp, 2), lambda x: exact(x[0, 0, 0, 100], 100.25 / (_WIDTH - 0.5) * 1.0, 1e-3)),
@@ -136,15 +131,15 @@ def optics() -> list[Method]:
 def supersampling() -> list[Method]:
     """Rays per pixel along each axis: a picture of edges and lines against its exact mean over each pixel (by 32 x 32)."""
     picture = lambda s: _star(resized(Camera(80, 60, 50.0, 50.0, 39.5, 29.5), 80 * s))
-    truth = aperture(picture(32), 32)
+    sampled = lambda s: aperture(picture(s), s)
+    return _sampled("a star of 36 rays", sampled, sampled(32), (1, 2, 3, 4, 8))
 
+
+def _sampled(problem: str, light: Callable[[int], Tensor], truth: Tensor, samples: Sequence[int]) -> list[Method]:
+    """``light`` (..., H, W) by its samples per pixel along each axis."""
     judge = lambda found: typical((found - truth).abs().numpy())
-
-    run = lambda s: aperture(picture(s), s)
-    return [
-        Method("supersampling", "a star of 36 rays", f"{s} x {s}", functools.partial(run, s), judge, 80 * 60, "full scale")
-        for s in (1, 2, 3, 4, 8)
-    ]
+    count = truth.shape[-1] * truth.shape[-2]
+    return [Method(problem, f"{s} x {s}", functools.partial(light, s), judge, count, "full scale") for s in samples]
 
 
 def _star(camera: Camera) -> Tensor:
@@ -157,14 +152,10 @@ def _star(camera: Camera) -> Tensor:
 
 def of_the_field(field: Field) -> list[Method]:
     """The first sensor of a fitted field, rays per pixel along each axis, against 8 x 8."""
-    from mmsynth.operations.simulation.frames import render_light
-    from mmsynth.operations.simulation.plan import SimulatedSensor
-
     name = next(iter(field.sensors))
     camera = field.cameras[name]
-    centre = np.array(field.region.centre)
     pose = np.eye(4)
-    pose[:3, 3] = centre - np.array([0.0, 0.0, 3.0 * field.region.radius])
+    pose[:3, 3] = np.array(field.region.centre) - [0.0, 0.0, 3.0 * field.region.radius]
     file = SensorFile.model_validate({"name": name, "instance_of": name, "noise": _PLAIN})
 
     def light(s: int) -> Tensor:
@@ -172,12 +163,7 @@ def of_the_field(field: Field) -> list[Method]:
         planned = SimulatedSensor(file, field.sensors[name], camera, np.eye(4), (name,), s, False, own_light, {})
         return render_light(field, planned, PosedCamera(camera, pose))
 
-    truth = light(8)
-
-    judge = lambda found: typical((found - truth).abs().numpy())
-
-    count = camera.width * camera.height
-    return [Method("of the field", name, f"{s} x {s}", functools.partial(light, s), judge, count, "full scale") for s in (1, 2, 3, 4)]
+    return _sampled(name, light, light(8), (1, 2, 3, 4))
 
 
 # --- calibration and spectra
@@ -210,16 +196,13 @@ def calibration() -> list[Method]:
             return photon_transfer_of_frames(frames, np.zeros((1, 1), np.int64), model.bits, model.black_dn)
 
         def judge(found: Any) -> dict[str, float]:
-            errors = {
-                "gain": abs(found.gain_dn_e / model.gain_dn_e - 1),
-                "read": abs(found.read_e / model.read_e - 1),
-                "prnu": abs(found.prnu / model.prnu - 1),
-            }
+            off = lambda figure: abs(getattr(found, figure) / getattr(model, figure) - 1)
+            errors = {"gain": off("gain_dn_e"), "read": off("read_e"), "prnu": off("prnu")}
             return {"error": errors["gain"], "worst": max(errors.values()), **errors, "read_at_best": at_best}
 
         exposed = f"{count} frame{'s' * (count > 1)}, exposure 1/{share}"
         run = of_truth if name == "the truth" else of_model
-        return Method("calibration", f"from {name}", exposed, run, judge, light.size, "of the figure")
+        return Method(f"from {name}", exposed, run, judge, light.size, "of the figure")
 
     return [method(name, *case) for name in ("the truth", "a model") for case in ((1, 1), (4, 1), (4, 4), (4, 16))]
 
@@ -259,13 +242,10 @@ def spectra() -> list[Method]:
 
         def judge(found: Any) -> dict[str, float]:
             error = found.weights @ noisy - truth
-            return {
-                "error": float(np.sqrt(np.mean(error**2) / np.mean(truth**2))),
-                "expected_error": found.residual,
-                "noise_gain": found.noise_gain,
-            }
+            relative = float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
+            return {"error": relative, "expected_error": found.residual, "noise_gain": found.noise_gain}
 
-        return Method("spectra", "30 nm at 560 nm", f"{count} bands", lambda: combine(wanted, bands), judge, 1, "of the value")
+        return Method("30 nm at 560 nm", f"{count} bands", lambda: combine(wanted, bands), judge, 1, "of the value")
 
     return [method(count) for count in (3, 4, 6, 9, 16, 25)]
 
@@ -281,32 +261,10 @@ def bench_twin(
     Raises:
         InputError: an unknown name, or ``out`` cannot be written.
     """
-    families = chosen_families(FAMILIES, "twin", only)
-    rows = measured_methods([m for family in families.values() for m in family()], repeats, progress)
+    families = {name: family() for name, family in chosen_families(FAMILIES, "twin", only).items()}
+    rows = measured(families, repeats, progress)
     if field is not None:
-        rows += measured_methods(of_the_field(field), min(repeats, 3), progress)
+        rows += measured({"of the field": of_the_field(field)}, min(repeats, 3), progress)
     figure = scatter_panels(rows, ("ns", "ns per element"), ("error", "error [{unit}]"), "{problem}: {method}")
     results = {"bench": "twin", "machine": measure(), "rows": rows, "repeats": repeats}
-    return write_report(results, tables_of(rows), figure, out)
-
-
-def tables_of(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """A table per family."""
-    columns = (
-        Column("problem", "problem"),
-        Column("method", "method"),
-        Column("ns", "ns", ".1f"),
-        Column("found", "found", ".5g"),
-        Column("closed form", "truth", ".5g"),
-        Column("deviations", "deviations", ".1f"),
-        Column("error", "error", ".1e"),
-        Column("worst", "worst", ".1e"),
-        Column("expected_error", "expected error", ".1e"),
-        Column("noise gain", "noise_gain", ".2f"),
-        Column("gain", "gain", ".1%"),
-        Column("read", "read", ".1%"),
-        Column("read, at best", "read_at_best", ".1%"),
-        Column("PRNU", "prnu", ".1%"),
-        Column("in", "unit"),
-    )
-    return family_tables(rows, columns, (*FAMILIES, of_the_field))
+    return write_report(results, family_tables(rows, (*FAMILIES, of_the_field)), figure, out)

@@ -40,15 +40,6 @@ class Decisions:
         return {**{f"view_dependence.{name}": choice for name, choice in self.view_dependence.items()}, "exposure": self.exposure}
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """Predicted and measured numbers of one modality, (N,) each, in units of its level, clipped ones left out; frame: (N,) index."""
-
-    predicted: np.ndarray
-    target: np.ndarray
-    frame: np.ndarray
-
-
 @torch.no_grad()
 def decide(field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
     """Put the residuals of a field as it is to the tests of this module."""
@@ -74,15 +65,13 @@ def _degree(errors: list[float], worth: float) -> Choice[int]:
 
 
 def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measurements], recipe: RadianceRecipe) -> Choice[bool]:
-    spreads, begin = {}, 0
+    spreads = {}
     usable = batch.target < batch.saturation
     for name, (_, own) in batch.parts.items():
         m, kept = measurements[name], usable[own]
-        of_modality = predicted[own][kept] / m.radiance_scale, batch.target[own][kept] / m.radiance_scale, batch.frame[own][kept] - begin
-        frames = len(m.origins)
-        spread, noise = exposure_spread(Residuals(*(x.cpu().numpy() for x in of_modality)), frames)
-        begin += frames
-        spreads[name] = spread if spread > 2 * noise / math.sqrt(max(frames, 1)) else 0.0
+        of_modality = predicted[own][kept] / m.radiance_scale, batch.target[own][kept] / m.radiance_scale, batch.frame[own][kept]
+        spread, noise = exposure_spread(*(x.cpu().numpy() for x in of_modality))
+        spreads[name] = spread if spread > 2 * noise / math.sqrt(len(m.origins)) else 0.0
     why = "exposure differs between frames by " + ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
     if recipe.exposure != "auto":
         return switch(recipe.exposure == "on", f"asked for by the recipe; {why}")
@@ -126,15 +115,18 @@ def degree_needed(errors: list[float], worth: float) -> int:
     return next((degree for degree, error in enumerate(errors) if error <= (1.0 + worth) * min(errors)), 0)
 
 
-def exposure_spread(residuals: Residuals, frames: int) -> tuple[float, float]:
+def exposure_spread(predicted: np.ndarray, target: np.ndarray, frame: np.ndarray) -> tuple[float, float]:
     """Standard deviation of log exposure between frames beyond what noise gives, and the error of one frame's, medians.
 
     Each frame's gain is the least-squares factor between predicted and target.
+
+    Args:
+        predicted, target: numbers of one modality that are not clipped, (N,) each, in units of its level. frame: (N,) index.
     """
     gains, errors = [], []
-    for frame in range(frames):
-        here = residuals.frame == frame
-        p, t = residuals.predicted[here].astype(np.float64), residuals.target[here].astype(np.float64)
+    for index in np.unique(frame):
+        here = frame == index
+        p, t = predicted[here].astype(np.float64), target[here].astype(np.float64)
         power = float(p @ p)
         if here.sum() < 16 or power <= 0:
             continue

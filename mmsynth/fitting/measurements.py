@@ -76,7 +76,7 @@ class Measurements:
             pixels, alpha = load_frame(sensor, frame)
             values.append(_compact(pixels.reshape(-1, 1 if pixels.ndim == 2 else pixels.shape[2])))
             alphas.append(alpha)
-        self.starts = np.cumsum([0] + [len(v) for v in values])[:-1]
+        self.starts = _begins([len(v) for v in values])
         self.values = _joined(values)
         self.has_alpha = any(a is not None for a in alphas)
         # a frame without alpha beside frames with one is opaque
@@ -86,16 +86,19 @@ class Measurements:
         poses = np.stack([f.camera_to_world for f in frames])
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
         self.set_poses(poses)
-        self.directions, self.usable = [], []
-        for camera in self.cameras:
-            rays, valid = ray_map(camera)
-            self.directions.append(rays.reshape(-1, 3).astype(np.float32))
-            self.usable.append(None if valid.all() else np.flatnonzero(valid))
-            if not valid.any():
-                raise InputError(f"{sensor.name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
-        self.counts = np.array([_count(self.usable[c], self.directions[c]) for c in self.camera_index])
+        directions, valid = zip(*(ray_map(camera) for camera in self.cameras), strict=True)
+        usable = [np.flatnonzero(v) for v in valid]
+        if not all(map(len, usable)):
+            raise InputError(f"{sensor.name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
+        # one camera after the other; of each frame, where its camera begins
+        self.directions = np.concatenate([d.reshape(-1, 3).astype(np.float32) for d in directions])
+        channels = [channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras if sensor.mosaic is not None]
+        self.channels = np.concatenate(channels) if channels else None
+        self.usable = None if all(v.all() for v in valid) else np.concatenate(usable)
+        self.first = _begins([v.size for v in valid])[self.camera_index]
+        self.first_usable = _begins([len(u) for u in usable])[self.camera_index]
+        self.counts = np.array([len(u) for u in usable])[self.camera_index]
         self.ends = np.cumsum(self.counts)
-        self.channels = [None if sensor.mosaic is None else channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras]
         drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
         self.radiance_scale = float(self.read(drawn, pixel)[0].mean())
 
@@ -109,20 +112,11 @@ class Measurements:
         drawn = random.integers(0, self.ends[-1], count)
         frame = np.searchsorted(self.ends, drawn, side="right")
         pixel = drawn - (self.ends[frame] - self.counts[frame])
-        for c, usable in enumerate(self.usable):
-            if usable is not None:
-                here = self.camera_index[frame] == c
-                pixel[here] = usable[pixel[here]]
-        return frame, pixel
+        return frame, pixel if self.usable is None else self.usable[self.first_usable[frame] + pixel]
 
     def rays(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions, (N, 3) float32 each, normalised frame."""
-        in_camera = np.empty((len(frame), 3), np.float32)
-        if len(self.directions) == 1:
-            in_camera = self.directions[0][pixel]
-        for c, directions in enumerate(self.directions if len(self.directions) > 1 else []):
-            here = self.camera_index[frame] == c
-            in_camera[here] = directions[pixel[here]]
+        in_camera = self.directions[self.first[frame] + pixel]
         return self.origins[frame], np.einsum("nij,nj->ni", self.rotations[frame], in_camera)
 
     def read(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
@@ -136,15 +130,7 @@ class Measurements:
 
     def measured(self, frame: np.ndarray, pixel: np.ndarray) -> np.ndarray | None:
         """Channel that each pixel of a mosaic measures, (N,) int64; None when pixels measure all channels."""
-        if self.sensor.mosaic is None:
-            return None
-        if len(self.channels) == 1:
-            return self.channels[0][pixel]  # type: ignore[index]
-        out = np.empty(len(pixel), np.int64)
-        for c, channels in enumerate(self.channels):
-            here = self.camera_index[frame] == c
-            out[here] = channels[pixel[here]]  # type: ignore[index]
-        return out
+        return None if self.channels is None else self.channels[self.first[frame] + pixel]
 
 
 def in_order(measurements: dict[str, Measurements]) -> list[str]:
@@ -166,8 +152,7 @@ def draw(
     """
     order = in_order(measurements)
     parts: dict[str, tuple[slice, slice]] = {}
-    lists: dict[str, list[np.ndarray]] = {k: [] for k in ("origins", "directions", "target", "ray", "output", "axes", "frame", "alpha")}
-    numbers = []
+    lists: dict[str, list[np.ndarray]] = {"axes": [np.empty((0, 3), np.float32)]}
     r_end = m_end = frames = 0
     for name in order:
         m, count = measurements[name], rays[name]
@@ -187,25 +172,22 @@ def draw(
             output = columns[name].start + channel
         else:
             output = np.tile(np.arange(columns[name].start, columns[name].stop), count)
-        lists["origins"].append(origins)
-        lists["directions"].append(directions)
-        lists["target"].append(target.reshape(-1))
-        lists["ray"].append(np.repeat(np.arange(r_end, r_end + count), values))
-        lists["output"].append(output)
-        lists["frame"].append(np.repeat(frame + frames, values))
-        frames += len(m.origins)
-        lists["alpha"].append(np.full(count, np.nan, np.float32) if alpha is None else alpha)
-        parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + count * values)
-        r_end += count
-        m_end += count * values
-        numbers.append((count * values, m.radiance_scale, m.sensor.saturation, 1.0 / (len(order) * count * values)))
-    lengths = [n[0] for n in numbers]
-    joined = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in lists.items() if v}
-    level, saturation, weight = (
-        torch.from_numpy(np.repeat(np.array(x, np.float32), lengths)).to(device) for x in zip(*(n[1:] for n in numbers), strict=True)
-    )
-    joined.setdefault("axes", torch.empty(0, 3, device=device))
-    return Batch(**joined, level=level, saturation=saturation, weight=weight, parts=parts)
+        of_all = {"level": m.radiance_scale, "saturation": m.sensor.saturation, "weight": 1.0 / (len(order) * target.size)}
+        drawn = {
+            "origins": origins,
+            "directions": directions,
+            "target": target.reshape(-1),
+            "ray": np.repeat(np.arange(r_end, r_end + count), values),
+            "output": output,
+            "frame": np.repeat(frame + frames, values),
+            "alpha": np.full(count, np.nan, np.float32) if alpha is None else alpha,
+            **{key: np.full(target.size, value, np.float32) for key, value in of_all.items()},
+        }
+        for key, value in drawn.items():
+            lists.setdefault(key, []).append(value)
+        parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + target.size)
+        r_end, m_end, frames = r_end + count, m_end + target.size, frames + len(m.origins)
+    return Batch(**{key: torch.from_numpy(np.concatenate(values)).to(device) for key, values in lists.items()}, parts=parts)
 
 
 def load_measurements(scene: Scene) -> dict[str, Measurements]:
@@ -227,16 +209,17 @@ def load_measurements(scene: Scene) -> dict[str, Measurements]:
     return out
 
 
-def _count(usable: np.ndarray | None, directions: np.ndarray) -> int:
-    return len(directions) if usable is None else len(usable)
+def _begins(counts: list[int]) -> np.ndarray:
+    """Where each of several parts begins that lie one after the other."""
+    return np.cumsum([0, *counts])[:-1]
 
 
 def _compact(values: np.ndarray) -> np.ndarray:
     """float32 in [0, 1] → the integers it came from, when it came from 8 or 16 bit; else as it is."""
-    for dtype, full in ((np.uint8, 255.0), (np.uint16, 65535.0)):
+    for dtype in (np.uint8, np.uint16):
         if values.size and values.min() >= 0 and values.max() <= 1:
-            integers = np.rint(values * np.float32(full)).astype(dtype)
-            if np.array_equal(integers.astype(np.float32) / np.float32(full), values):
+            integers = np.rint(values * np.float32(np.iinfo(dtype).max)).astype(dtype)
+            if np.array_equal(_decode(integers), values):
                 return integers
     return values
 
@@ -249,6 +232,4 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 def _decode(stored: np.ndarray) -> np.ndarray:
     """Back to float32, 1.0 = full scale."""
-    if stored.dtype == np.float32:
-        return stored
-    return stored.astype(np.float32) / np.float32(255.0 if stored.dtype == np.uint8 else 65535.0)
+    return stored if stored.dtype == np.float32 else stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)

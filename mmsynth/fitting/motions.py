@@ -71,17 +71,9 @@ class NormalEquations:
     error: np.ndarray
     weight: np.ndarray
 
-    def half(self, index: int) -> NormalEquations:
-        """One of those that ``normal_equations`` keeps apart."""
-        return NormalEquations(self.matrix[index], self.vector[index], self.error[index], self.weight[index])
-
-    def both(self) -> NormalEquations:
-        return NormalEquations(self.matrix.sum(0), self.vector.sum(0), self.error.sum(0), self.weight.sum(0))
-
-    @property
-    def variance(self) -> float:
-        """Of a residual."""
-        return float(self.error.sum() / self.weight.sum())
+    def of(self, *halves: int) -> NormalEquations:
+        """Of one or both of the halves that ``normal_equations`` keeps apart."""
+        return NormalEquations(*(x[list(halves)].sum(0) for x in (self.matrix, self.vector, self.error, self.weight)))
 
 
 @dataclass(frozen=True)
@@ -172,20 +164,18 @@ def solve(equations: NormalEquations, layout: Layout, motions: Motions, views: b
     now = moved(layout, motions)
     here = _adjoint(now, now[layout.anchor][layout.view])
     back = np.swapaxes(here, 1, 2)
-    precision = equations.variance / prior**2
+    precision = float(equations.error.sum() / equations.weight.sum()) / prior**2
     own = precision * np.eye(6)
-    to_view, to_sensor = np.zeros_like(motions.views), np.zeros_like(motions.sensors)
-    free = np.flatnonzero(layout.free)
+    to_sensor = np.zeros_like(motions.sensors)
+    free = np.flatnonzero(layout.free & rig)
     # of the views: block diagonal; of the sensors, after the views are eliminated: small and dense
     matrix_v = _grouped(back @ equations.matrix @ here, layout.view, len(layout.views)) + own
     vector_v = _grouped(_times(back, equations.vector), layout.view, len(layout.views)) + precision * motions.views
     matrix_s = _grouped(equations.matrix, layout.sensor, len(layout.sensors)) + own
     vector_s = _grouped(equations.vector, layout.sensor, len(layout.sensors)) + precision * motions.sensors
-    if not rig:
-        return Motions(-_solved(matrix_v, vector_v), to_sensor)
     if not views:
         to_sensor[free] = -_solved(matrix_s[free], vector_s[free])
-        return Motions(to_view, to_sensor)
+        return Motions(np.zeros_like(motions.views), to_sensor)
     pairs = np.zeros((len(layout.views), len(layout.sensors), 6, 6))
     np.add.at(pairs, (layout.view, layout.sensor), back @ equations.matrix)
     cross = pairs[:, free].swapaxes(1, 2).reshape(len(layout.views), 6, 6 * len(free))
@@ -210,15 +200,15 @@ def cross_validated_step(
     here = _adjoint(now, now[layout.anchor][layout.view])
     quadratic, linear = np.zeros((2, 2)), np.zeros(2)
     for learned, other in ((0, 1), (1, 0)):
-        step = solve(equations.half(learned), layout, motions, views, rig, prior)
+        step = solve(equations.of(learned), layout, motions, views, rig, prior)
         of_frames = np.stack([_times(here, step.views[layout.view]), step.sensors[layout.sensor]])
-        judge = equations.half(other)
+        judge = equations.of(other)
         quadratic += np.einsum("kfi,fij,lfj->kl", of_frames, judge.matrix, of_frames)
         linear += np.einsum("kfi,fi->k", of_frames, judge.vector)
     factor = np.clip(-np.linalg.lstsq(quadratic, linear, rcond=1e-9)[0], 0.0, 1.0)
     saved = -(2.0 * factor @ linear + factor @ quadratic @ factor) / float(equations.error.sum())
     factor = 2.0 * factor / (1.0 + factor)
-    step = solve(equations.both(), layout, motions, views, rig, prior)
+    step = solve(equations.of(0, 1), layout, motions, views, rig, prior)
     return Motions(factor[0] * step.views, factor[1] * step.sensors), float(saved)
 
 
@@ -278,10 +268,7 @@ def _adjoint(to: np.ndarray, of: np.ndarray) -> np.ndarray:
 
 def _cross(v: np.ndarray) -> np.ndarray:
     """(..., 3) → (..., 3, 3), the matrix of w → v × w."""
-    out = np.zeros((*v.shape, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., i, j], out[..., j, i] = -v[..., k], v[..., k]
-    return out
+    return np.cross(np.eye(3), v[..., None, :])
 
 
 def _grouped(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:

@@ -7,14 +7,13 @@ without a polarization sensor (heads follow the sensors), no grid level finer th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mmsynth.field.field import Design
-from mmsynth.fitting.choices import Choice, summary, switch
+from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
@@ -38,7 +37,7 @@ class Needs:
         black_background: whether black pixels say that nothing is there.
         sparse: modalities with so few pixels that they would spoil what others know better: they learn their colours from the
             geometry and appearance of the others. share: of the rays that each modality gets, relative to a plentiful one.
-        choices: by name, those made so far.
+        choices: by name, those made so far; what is decided later is added.
     """
 
     design: Design
@@ -48,17 +47,6 @@ class Needs:
     sparse: tuple[str, ...]
     share: dict[str, float]
     choices: dict[str, Choice[Any]]
-
-    def with_choices(self, more: Mapping[str, Choice[Any]]) -> Needs:
-        """With what was decided since."""
-        return replace(self, choices={**self.choices, **more})
-
-    def summary(self, verbose: bool = False) -> list[str]:
-        """One line for each choice that changed something; ``verbose``: for all of them."""
-        return summary(self.choices, verbose)
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -154,9 +142,6 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     )
 
 
-# ---------------------------------------------------------------------------------------------------- the questions, in their order
-
-
 def _background(f: _Facts) -> Choice[bool]:
     """Is what lies outside the region modelled?"""
     asked = f.recipe.surface.background
@@ -244,9 +229,6 @@ def _table_rows(f: _Facts) -> Choice[tuple[int, int]]:
     # a row that few rays meet is noise, and costs as much as any other
     rows = rows_log2(f.rays_to_come / surface.rays_per_row, most[0]), rows_log2(f.rays_to_come / radiance.rays_per_row, most[1])
     return Choice(rows, f"at most 2^{rows[0]} and 2^{rows[1]} rows a level for {f.rays_to_come:.1e} rays", rows != most)
-
-
-# --------------------------------------------------------------------------------------------------------------------- the facts
 
 
 def _footprint(measurements: dict[str, Measurements]) -> float:

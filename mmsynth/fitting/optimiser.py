@@ -18,7 +18,7 @@ class Adam:
 
     def __init__(self, parameters: dict[str, nn.Parameter], rates: dict[str, float]) -> None:
         self.parameters, self.rates = parameters, rates
-        self.moments = {n: (torch.zeros_like(p), torch.zeros_like(p)) for n, p in parameters.items()}
+        self.moments = {n: [torch.zeros_like(p), torch.zeros_like(p)] for n, p in parameters.items()}
         self.count = 0
 
     @torch.no_grad()
@@ -38,10 +38,7 @@ class Adam:
 
     def resize(self, name: str, kept: int) -> None:
         """Follow a parameter that has new rows behind its first ``kept``."""
-        grown = [torch.zeros_like(self.parameters[name]) for _ in range(2)]
-        for new, old in zip(grown, self.moments[name], strict=True):
-            new[:kept] = old[:kept]
-        self.moments[name] = grown[0], grown[1]
+        self.moments[name] = [torch.cat([m[:kept], torch.zeros_like(self.parameters[name][kept:])]) for m in self.moments[name]]
 
     def clear(self) -> None:
         """Drop the gradients without a step."""
@@ -50,7 +47,7 @@ class Adam:
                 parameter.grad.zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        return {"count": self.count, "moments": {n: list(m) for n, m in self.moments.items()}}
+        return {"count": self.count, "moments": dict(self.moments)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.count = state["count"]

@@ -132,10 +132,8 @@ class Refinement:
         views, rig = by_both - by_rig > worth, by_both - by_views > worth
         if not views and not rig and max(by_views, by_rig) > worth:
             views, rig = by_views > by_rig, by_rig >= by_views  # one does as well as the other
-        why = "would save {:.1%} of the error of rays not learned from, and cost {:.0e} rays of the fit"
-        return self._decisions(
-            views, rig, f"motions of views {why.format(by_views, _PER_FIT)}", f"motions of sensors {why.format(by_rig, _PER_FIT)}"
-        )
+        why = "motions of {} would save {:.1%} of the error of rays not learned from, and cost {:.0e} rays of the fit"
+        return self._decisions(views, rig, why.format("views", by_views, _PER_FIT), why.format("sensors", by_rig, _PER_FIT))
 
     def _decisions(self, views: bool, rig: bool, of_views: str, of_rig: str) -> MotionDecisions:
         """What residuals want, and why, put to what the recipe wants and the scene allows."""
@@ -153,11 +151,9 @@ class Refinement:
         )
 
     def _set_poses(self) -> None:
-        now, begin = poses.moved(self.layout, self.motions), 0
-        for name in in_order(self.measurements):
-            m = self.measurements[name]
-            m.set_poses(now[begin : begin + len(m.origins)])
-            begin += len(m.origins)
+        now = poses.moved(self.layout, self.motions)
+        for s, name in enumerate(self.layout.sensors):
+            self.measurements[name].set_poses(now[self.layout.sensor == s])
 
     def corrections(self) -> Corrections:
         """The motions in the scene's frame and unit; those of sensors and views that have none are left out."""
@@ -174,34 +170,22 @@ class Refinement:
 
     def sizes(self) -> dict[str, dict[str, dict[str, float]]]:
         """How far each view (by id) and sensor (by name) was moved: degrees, length (scene unit), pixels (of the region's picture)."""
-        layout = self.layout
-        metric = {
-            "views": layout.pixels[layout.anchor],
-            "sensors": np.array([layout.pixels[layout.sensor == s].mean(0) for s in range(len(layout.sensors))]),
-        }
-        names = {"views": layout.views, "sensors": layout.sensors}
-        motions = {"views": self.motions.views, "sensors": self.motions.sensors}
-        return {
-            kind: {
-                str(name): {
-                    "degrees": float(np.degrees(np.linalg.norm(m[:3]))),
-                    "length": float(np.linalg.norm(m[3:]) * self.region.radius),
-                    "pixels": float(np.sqrt(m @ metric[kind][i] @ m)),
-                }
-                for i, (name, m) in enumerate(zip(names[kind], motions[kind], strict=True))
-                if m.any()
-            }
-            for kind in ("views", "sensors")
-        }
+        layout, motions = self.layout, self.motions
+
+        def size(motion: np.ndarray, metric: np.ndarray) -> dict[str, float]:
+            degrees, length = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:]) * self.region.radius
+            return {"degrees": float(degrees), "length": float(length), "pixels": float(np.sqrt(motion @ metric @ motion))}
+
+        views = zip(layout.views, motions.views, layout.pixels[layout.anchor], strict=True)
+        sensors = (
+            (n, m, layout.pixels[layout.sensor == s].mean(0)) for s, (n, m) in enumerate(zip(layout.sensors, motions.sensors, strict=True))
+        )
+        return {kind: {str(n): size(m, p) for n, m, p in named if m.any()} for kind, named in (("views", views), ("sensors", sensors))}
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "views": torch.from_numpy(self.motions.views),
-            "sensors": torch.from_numpy(self.motions.sensors),
-            "decided": None if self.decided is None else asdict(self.decided),
-            "steps": self.steps,
-            "next": self.next,
-        }
+        views, sensors = torch.from_numpy(self.motions.views), torch.from_numpy(self.motions.sensors)
+        decided = None if self.decided is None else asdict(self.decided)
+        return {"views": views, "sensors": sensors, "decided": decided, "steps": self.steps, "next": self.next}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.motions = Motions(state["views"].numpy(), state["sensors"].numpy())

@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
             "test_views": list(scene.split.test),
         },
         "recipe": trainer.recipe.model_dump(),
-        "needs": trainer.needs.to_json(),
+        "needs": asdict(trainer.needs),
         "exposure": trainer.gains(),
         "poses": _poses(trainer, scene),
         "seed": trainer.seed,

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,8 @@ class _State:
     reopened: int = 0
     tables: TableSizes | None = None
     decided: Decisions | None = None
+    mean_loss: float = math.nan
+    mean_error: dict[str, float] = field(default_factory=dict)
 
 
 class Trainer:
@@ -93,10 +95,14 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.needs = self.needs.with_choices(self.refinement.choices)
+        self.needs.choices.update(self.refinement.choices)
         self.has_alpha = any(m.has_alpha for m in self.measurements.values())
-        self.mean_loss = math.nan
-        self.mean_error: dict[str, float] = {}
+        self.parts: dict[str, Any] = {
+            "field": self.field,
+            "optimiser": self.optimiser,
+            "average": self.average,
+            "refinement": self.refinement,
+        }
 
     @property
     def progress(self) -> float:
@@ -128,7 +134,7 @@ class Trainer:
                 self._take(state.decided)
         if self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
-            self.needs = self.needs.with_choices(self.refinement.choices)
+            self.needs.choices.update(self.refinement.choices)
         total = sum(self.needs.share.values())
         rays = {n: max(1, int(state.rays * share / total)) for n, share in self.needs.share.items()}
         batch = draw(self.measurements, field.shader.columns, rays, random, self.device)
@@ -143,17 +149,14 @@ class Trainer:
             self._skip("a gradient is not finite")
             return
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, recipe))
-        grids = {
-            "surface.grid.table": (field.surface.grid, sampling.active_surface),
-            "appearance.table": (field.appearance, sampling.active_radiance),
-        }
-        rows = {n: int(grid.offsets[active]) for n, (grid, active) in grids.items()}
+        surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
+        rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
         self.optimiser.step(learning_rate_factor(self.progress, recipe), slower, rows)
         keep = 0.98 if state.step else 0.0
-        first = math.isnan(self.mean_loss)  # also after steps that were skipped
-        self.mean_loss = float(loss.detach()) if first else keep * self.mean_loss + (1 - keep) * float(loss.detach())
+        value = float(loss.detach())
+        state.mean_loss = value if math.isnan(state.mean_loss) else keep * state.mean_loss + (1 - keep) * value  # nan: all were skipped
         for name, error in errors.items():
-            self.mean_error[name] = keep * self.mean_error.get(name, error) + (1 - keep) * error
+            state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         done = self.progress
         if recipe.schedule.ema_fraction > 0 and done >= 1.0 - 4.0 * recipe.schedule.ema_fraction and state.step % _AVERAGE_EVERY == 0:
             self.average.update(recipe.schedule.ema_fraction * state.step / max(done, 1e-9) / _AVERAGE_EVERY)
@@ -166,9 +169,8 @@ class Trainer:
 
     def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
         recipe, field = self.recipe, self.field
-        origins, directions = batch.origins, batch.directions
-        jitter = torch.rand(len(origins), generator=generator).to(self.device)
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
+        jitter = torch.rand(len(batch.origins), generator=generator).to(self.device)
+        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
         degrees = batch.per_ray(field.view_dependence)
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains_geometry = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
@@ -179,12 +181,12 @@ class Trainer:
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_alpha:
             known = torch.isfinite(batch.alpha)
-            loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(origins)
+            loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(jitter)
         elif self.needs.black_background:
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, batch.ray, batch.target / batch.level, "amax") < 0.02
             loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
-            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, origins, directions, sampling, generator))
+            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, batch, sampling, generator))
         return loss, errors, int(hits.samples)
 
     @property
@@ -209,20 +211,13 @@ class Trainer:
         for name, rows in kept.items():
             self.optimiser.resize(name, rows)
             self.average.resize(name, rows)
-        self.needs = self.needs.with_choices({"tables": sizes.choice})
+        self.needs.choices["tables"] = sizes.choice
 
     def _take(self, decisions: Decisions) -> None:
         self.field.view_dependence.update({name: choice.value for name, choice in decisions.view_dependence.items()})
-        self.needs = self.needs.with_choices(decisions.choices)
+        self.needs.choices.update(decisions.choices)
 
-    def _gradients(
-        self,
-        hits: kernels.Hits,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
-        sampling: kernels.Sampling,
-        generator: torch.Generator,
-    ) -> torch.Tensor:
+    def _gradients(self, hits: kernels.Hits, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> torch.Tensor:
         """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""
         count = self.recipe.loss.eikonal_points
         extent = self.field.surface.grid.extent
@@ -231,7 +226,7 @@ class Trainer:
         if len(hit):
             chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
             noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
-            at = origins[chosen] + directions[chosen] * hits.depth[chosen, None]
+            at = batch.origins[chosen] + batch.directions[chosen] * hits.depth[chosen, None]
             points.append(self.field.surface.grid.to_grid(at) + noise)
         epsilon = self.field.surface.grid.cell(sampling.active_surface)
         return self.field.surface.gradient(torch.cat(points), epsilon, sampling.active_surface)
@@ -253,24 +248,14 @@ class Trainer:
     def report(self) -> FitProgress:
         """News for a progress bar."""
         s = self.state
-        psnr = {n: psnr_from_mse(e) for n, e in self.mean_error.items()}
+        psnr = {n: psnr_from_mse(e) for n, e in s.mean_error.items()}
         rate = 1.0 / max(s.elapsed, 1e-9)
-        return FitProgress(s.step, self.progress, s.elapsed, self.mean_loss, psnr, s.rays_total * rate, s.samples_total * rate)
+        return FitProgress(s.step, self.progress, s.elapsed, s.mean_loss, psnr, s.rays_total * rate, s.samples_total * rate)
 
     def checkpoint(self) -> dict[str, Any]:
         """All state, as tensors and numbers."""
-        return {
-            "version": 1,
-            "task": self.task,
-            "field": self.field.state_dict(),
-            "log_gain": self.log_gain.detach(),
-            "optimiser": self.optimiser.state_dict(),
-            "average": self.average.state_dict(),
-            "refinement": self.refinement.state_dict(),
-            "state": asdict(self.state),
-            "mean_loss": self.mean_loss,
-            "mean_error": dict(self.mean_error),
-        }
+        parts = {name: part.state_dict() for name, part in self.parts.items()}
+        return {"task": self.task, "log_gain": self.log_gain.detach(), "state": asdict(self.state), **parts}
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Take up a checkpoint.
@@ -287,15 +272,12 @@ class Trainer:
         self.state = TypeAdapter(_State).validate_python(saved["state"])
         if self.state.tables is not None:
             self._resize_tables(self.state.tables, torch.Generator())  # what is new is read from the checkpoint
-        self.field.load_state_dict(saved["field"])
-        self.optimiser.load_state_dict(saved["optimiser"])
+        for name, part in self.parts.items():
+            part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
-        self.average.load_state_dict(saved["average"])
-        self.refinement.load_state_dict(saved["refinement"])
-        self.needs = self.needs.with_choices(self.refinement.choices)
+        self.needs.choices.update(self.refinement.choices)
         if self.state.decided is not None:
             self._take(self.state.decided)
-        self.mean_loss, self.mean_error = saved["mean_loss"], dict(saved["mean_error"])
 
     def _task(self) -> dict[str, Any]:
         """What a checkpoint must agree on to be resumed: hash of the pixels and poses, recipe, seed, length."""
@@ -320,7 +302,6 @@ def rig_of(scene: Scene) -> dict[str, np.ndarray]:
     rig = {reference: np.eye(4)}
     for name in scene.sensors:
         for frame in scene.frames_of(name):
-            if name != reference and frame.view in poses:
-                rig[name] = np.linalg.inv(poses[frame.view]) @ frame.camera_to_world
-                break
+            if frame.view in poses:
+                rig.setdefault(name, np.linalg.inv(poses[frame.view]) @ frame.camera_to_world)
     return rig

@@ -120,7 +120,7 @@ def test_errors_are_differences_from_the_reference(field: Field, scene: Scene, r
 def test_the_reference_is_what_the_kernel_nears_and_is_not_cut_off(field: Field, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """By other code than the kernel that is timed, which has room for few samples a ray."""
     some = rays_of(field, scene)
-    rays = Rays(*some.tile(0, 24 * 18))
+    rays = Rays(*next(some.tiles(24 * 18)))
     truth = truth_of(field, rays)
     fused = field.sampling
     try:

@@ -6,36 +6,37 @@ import torch
 
 from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.decisions import DEGREES, Residuals, degree_needed, errors_by_degree, exposure_spread
+from mmsynth.fitting.decisions import DEGREES, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
 
 
-def _frames(gains: np.ndarray, noise: float, per_frame: int = 400) -> Residuals:
+def _frames(gains: np.ndarray, noise: float, per_frame: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Predicted, target and frame."""
     random = np.random.default_rng(0)
     frame = np.repeat(np.arange(len(gains)), per_frame)
     predicted = random.uniform(0.3, 1.5, len(frame))
-    return Residuals(predicted, gains[frame] * predicted + noise * random.normal(size=len(frame)), frame)
+    return predicted, gains[frame] * predicted + noise * random.normal(size=len(frame)), frame
 
 
 @pytest.mark.parametrize("spread", [0.03, 0.1, 0.3])
 def test_spread_of_exposure_is_found(spread: float) -> None:
     gains = np.exp(spread * np.random.default_rng(1).normal(size=200))
-    found, error = exposure_spread(_frames(gains, noise=0.1), 200)
+    found, error = exposure_spread(*_frames(gains, noise=0.1))
     assert found == pytest.approx(spread, rel=0.2)
     assert 0.003 < error < 0.01  # 0.1 of noise over 400 numbers of about 1
 
 
 def test_noise_alone_is_no_exposure() -> None:
-    found, error = exposure_spread(_frames(np.ones(200), noise=0.3), 200)
+    found, error = exposure_spread(*_frames(np.ones(200), noise=0.3))
     assert found < error
-    assert exposure_spread(_frames(np.ones(1), noise=0.1), 1) == (0.0, 0.0)
+    assert exposure_spread(*_frames(np.ones(1), noise=0.1)) == (0.0, 0.0)
 
 
 def test_one_odd_frame_is_no_exposure() -> None:
     gains = np.ones(40)
     gains[7] = 3.0
-    found, _ = exposure_spread(_frames(gains, noise=0.02), 40)
+    found, _ = exposure_spread(*_frames(gains, noise=0.02))
     assert found < 0.01
 
 

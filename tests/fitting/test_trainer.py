@@ -312,7 +312,7 @@ def test_a_loss_that_is_not_finite_skips_the_step(scene: Scene) -> None:
         trainer.field.shader.heads.bias[0] = 0.0
     trainer.run_step()
     assert (trainer.state.step, trainer.state.bad_steps, trainer.optimiser.count) == (3, 1, count + 1)
-    assert all(torch.isfinite(p).all() for p in trainer.field.parameters()) and math.isfinite(trainer.mean_loss)
+    assert all(torch.isfinite(p).all() for p in trainer.field.parameters()) and math.isfinite(trainer.state.mean_loss)
 
 
 @pytest.mark.parametrize("what", ["surface.output_weight", "shader.heads.weight", "surface.grid.table"])
