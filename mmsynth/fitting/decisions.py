@@ -66,10 +66,10 @@ def _degree(errors: list[float], worth: float) -> Choice[int]:
 
 def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measurements], recipe: RadianceRecipe) -> Choice[bool]:
     spreads = {}
-    usable = batch.target < batch.saturation
+    usable = batch.measured.target < batch.measured.saturation
     for name, (_, own) in batch.parts.items():
         m, kept = measurements[name], usable[own]
-        of_modality = predicted[own][kept] / m.radiance_scale, batch.target[own][kept] / m.radiance_scale, batch.frame[own][kept]
+        of_modality = predicted[own][kept] / m.radiance_scale, batch.measured.target[own][kept] / m.radiance_scale, batch.frame[own][kept]
         spread, noise = exposure_spread(*(x.cpu().numpy() for x in of_modality))
         spreads[name] = spread if spread > 2 * noise / math.sqrt(len(m.origins)) else 0.0
     why = "exposure differs between frames by " + ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
@@ -90,8 +90,8 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
     Returns:
         by modality; NaN where every number is clipped.
     """
-    learned = batch.ray % 2 == 0
-    usable = batch.target < batch.saturation
+    learned = batch.measured.ray % 2 == 0
+    usable = batch.measured.target < batch.measured.saturation
     out: dict[str, list[float]] = {name: [] for name in batch.parts}
     for degree in range(DEGREES + 1):
         candidate = copy.deepcopy(shader)

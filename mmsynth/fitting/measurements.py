@@ -22,14 +22,8 @@ from mmsynth.sensors.polarization import analyser_axes
 class Batch:
     """R rays of all modalities in the normalised frame, and the M numbers measured along them.
 
-    Numbers of one modality lie together, radiance before polarization.
-
     Attributes:
-        origins, directions: (R, 3).
-        target: (M,) raw values. ray: (M,) int64, never decreasing. output: (M,) int64, the shader output that predicts the number;
-            the first of six for a polarization.
-        axes: (P, 3) analyser axes of the last P numbers.
-        level, saturation, weight: (M,) the modality's typical value, where it clips, and the share in a mean over modalities.
+        origins, directions: (R, 3). measured: the numbers; those of one modality lie together.
         frame: (M,) int64, counted through the modalities in the order of ``parts``.
         parts: per modality its rays and its numbers.
         alpha: (R,) opacity to match, NaN = none.
@@ -37,21 +31,10 @@ class Batch:
 
     origins: Tensor
     directions: Tensor
-    target: Tensor
-    ray: Tensor
-    output: Tensor
-    axes: Tensor
-    level: Tensor
-    saturation: Tensor
-    weight: Tensor
+    measured: kernels.Measured
     frame: Tensor
     parts: dict[str, tuple[slice, slice]]
     alpha: Tensor
-
-    @property
-    def measured(self) -> kernels.Measured:
-        """What was measured along the rays, as the kernels take it."""
-        return kernels.Measured(self.target, self.ray, self.output, self.axes, self.level, self.saturation, self.weight)
 
     def per_ray(self, values: Mapping[str, float]) -> Tensor:
         """A value for each modality → one for each ray, (R,)."""
@@ -187,7 +170,9 @@ def draw(
             lists.setdefault(key, []).append(value)
         parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + target.size)
         r_end, m_end, frames = r_end + count, m_end + target.size, frames + len(m.origins)
-    return Batch(**{key: torch.from_numpy(np.concatenate(values)).to(device) for key, values in lists.items()}, parts=parts)
+    joined = {key: torch.from_numpy(np.concatenate(values)).to(device) for key, values in lists.items()}
+    measured = kernels.Measured(*(joined.pop(key) for key in kernels.Measured._fields))
+    return Batch(**joined, measured=measured, parts=parts)
 
 
 def load_measurements(scene: Scene) -> dict[str, Measurements]:

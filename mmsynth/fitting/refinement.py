@@ -58,12 +58,14 @@ def ray_residuals(
             hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
             features, opacity = field.with_far_light(hits) if far_light else (hits.features, hits.opacity)
             predicted = kernels.predict(field.shader(features, directions, degrees), opacity, batch.measured)
-            relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.level
-            mean = torch.zeros_like(middle).index_add(0, batch.ray, relative) / torch.bincount(batch.ray, minlength=len(origins))
+            relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.measured.level
+            mean = torch.zeros_like(middle).index_add(0, batch.measured.ray, relative) / torch.bincount(
+                batch.measured.ray, minlength=len(origins)
+            )
             gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
     finally:
         field.requires_grad_(True)
-    frame = batch.ray.new_zeros(len(origins)).scatter(0, batch.ray, batch.frame)
+    frame = batch.measured.ray.new_zeros(len(origins)).scatter(0, batch.measured.ray, batch.frame)
     return RayJacobian(frame.cpu(), *(x.detach().cpu().double() for x in (mean, *gradients, batch.directions)))
 
 

@@ -183,7 +183,10 @@ class Trainer:
             known = torch.isfinite(batch.alpha)
             loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(jitter)
         elif self.needs.black_background:
-            black = torch.zeros_like(hits.opacity).scatter_reduce(0, batch.ray, batch.target / batch.level, "amax") < 0.02
+            black = (
+                torch.zeros_like(hits.opacity).scatter_reduce(0, batch.measured.ray, batch.measured.target / batch.measured.level, "amax")
+                < 0.02
+            )
             loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
             loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, batch, sampling, generator))

@@ -15,7 +15,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mmsynth.field.kernels import cpu, reference
+from mmsynth.field.kernels import Measured, cpu, reference
 from mmsynth.field.kernels.cpu import shading as cpu_shading
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting import losses
@@ -59,6 +59,8 @@ class Case:
                 return x.detach().double() if x.is_floating_point() else x
             if isinstance(x, torch.nn.Module):
                 return copy.deepcopy(x).double()
+            if isinstance(x, Measured):
+                return Measured(*map(exact, x))
             return dataclasses.replace(x, **{k: exact(v) for k, v in vars(x).items()}) if dataclasses.is_dataclass(x) else x
 
         return exact(self)
@@ -95,8 +97,8 @@ def _case(count: int, modalities: tuple[Modality, ...] = ALL, width: int = 24, h
     directions, opacity = normalize(torch.randn(rays, 3), dim=1), torch.rand(rays)
     opacity[torch.rand(rays) < 0.2] = 0.0
     batch = Batch(
-        **joined, origins=torch.zeros(rays, 3), directions=directions, axes=torch.cat(axes) if axes else torch.empty(0, 3), frame=frame,
-        parts=parts, alpha=alpha,
+        origins=torch.zeros(rays, 3), directions=directions, frame=frame, parts=parts, alpha=alpha,
+        measured=Measured(**joined, axes=torch.cat(axes) if axes else torch.empty(0, 3)),
     )  # fmt: skip
     gain = torch.rand(len(joined["ray"])) + 0.5 if gains else None
     return Case(shader, torch.randn(rays, width), opacity, batch, torch.randint(4, (rays,)), torch.rand(rays) < 0.8, gain)
@@ -108,7 +110,7 @@ def _quantities(case: Case) -> dict[str, torch.Tensor]:
     for x in (*inputs.values(), *case.shader.parameters()):
         x.requires_grad_().grad = None
     loss, squared = _compare(case)
-    assert loss.shape == () and squared.shape == case.batch.target.shape and not squared.requires_grad
+    assert loss.shape == () and squared.shape == case.batch.measured.target.shape and not squared.requires_grad
     (3.0 * loss).backward()
     gradients = {name: x.grad for name, x in (*inputs.items(), *case.shader.named_parameters())}
     return {"loss": loss.detach(), "squared": squared, **{f"gradient of {n}": g for n, g in gradients.items()}}
@@ -137,9 +139,9 @@ def test_compare(count: int) -> None:
     case = _case(count)
     found = _check(case)
     if count == 300:
-        clipped = case.batch.target >= case.batch.saturation
+        clipped = case.batch.measured.target >= case.batch.measured.saturation
         assert 0.1 < clipped.float().mean() < 0.5 and (found["squared"][clipped] == 0).any()
-        assert (found["squared"].sqrt() > 0.5 * case.batch.level).any()  # the linear part of the loss, too
+        assert (found["squared"].sqrt() > 0.5 * case.batch.measured.level).any()  # the linear part of the loss, too
         for name in ("features", "opacity"):
             assert not found[f"gradient of {name}"][~case.trains_geometry].any() and found[f"gradient of {name}"].any()
 
@@ -197,8 +199,8 @@ def test_rays_that_miss_everything() -> None:
 
 def test_clipped_pixels_that_are_bright_enough_ask_for_nothing() -> None:
     case = _case(50)
-    case.batch.saturation[:] = 0.0
-    case.batch.target[:] = 0.0
+    case.batch.measured.saturation[:] = 0.0
+    case.batch.measured.target[:] = 0.0
     found = _check(case)
     assert not any(value.any() for value in found.values())
 

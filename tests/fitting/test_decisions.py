@@ -52,8 +52,8 @@ def test_the_degree_that_light_has_is_found(needed: int) -> None:
     ones = torch.ones(rays)
     every = torch.arange(rays)
     batch = Batch(
-        origins=torch.zeros(rays, 3), directions=directions, target=light, ray=every, output=torch.zeros(rays, dtype=torch.int64),
-        axes=torch.empty(0, 3), level=ones, saturation=9 * ones, weight=ones / rays, frame=0 * every,
+        origins=torch.zeros(rays, 3), directions=directions, frame=0 * every,
+        measured=kernels.Measured(light, every, 0 * every, torch.empty(0, 3), ones, 9 * ones, ones / rays),
         parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"),
     )  # fmt: skip
     teacher = torch.optim.Adam(shader.parameters(), lr=8e-3)

@@ -11,7 +11,7 @@ from conftest import ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmsynth.field.kernels import photometric, predict, residual
+from mmsynth.field.kernels import Measured, photometric, predict, residual
 from mmsynth.fitting.losses import eikonal
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.scene.images import load_frame
@@ -69,13 +69,21 @@ def test_a_batch_joins_all_modalities(batch: Batch) -> None:
         assert (rays.start, numbers.start) == (at_ray, at_number)
         assert rays.stop - rays.start == RAYS[name] and numbers.stop - numbers.start == RAYS[name] * per_ray[name]
         at_ray, at_number = rays.stop, numbers.stop
-        assert batch.ray[numbers].tolist() == np.repeat(np.arange(rays.start, rays.stop), per_ray[name]).tolist()
+        assert batch.measured.ray[numbers].tolist() == np.repeat(np.arange(rays.start, rays.stop), per_ray[name]).tolist()
     assert len(batch.origins) == len(batch.directions) == len(batch.alpha) == at_ray
-    for values in (batch.target, batch.ray, batch.output, batch.level, batch.saturation, batch.weight, batch.frame):
+    for values in (
+        batch.measured.target,
+        batch.measured.ray,
+        batch.measured.output,
+        batch.measured.level,
+        batch.measured.saturation,
+        batch.measured.weight,
+        batch.frame,
+    ):
         assert len(values) == at_number
     # radiance before polarization
     assert [n.startswith("pol") for n in batch.parts] == [False] * 3 + [True] * 2
-    assert len(batch.axes) == RAYS["pol"] + 3 * RAYS["pol3"]
+    assert len(batch.measured.axes) == RAYS["pol"] + 3 * RAYS["pol3"]
     assert batch.alpha.isnan().all()
     torch.testing.assert_close(batch.directions.norm(dim=1), torch.ones(at_ray))
 
@@ -86,7 +94,7 @@ def test_every_number_is_of_the_pixel_its_ray_goes_through(batch: Batch, frames:
         sensor = next(s for s in SENSORS if s.name == name)
         seen = set()
         for m in range(numbers.start, numbers.stop):
-            r = int(batch.ray[m])
+            r = int(batch.measured.ray[m])
             frame = frames[name][int(batch.frame[m]) - begin]
             world = batch.origins[r].double().numpy() * REGION.radius + REGION.centre
             np.testing.assert_allclose(world, frame.camera_to_world[:3, 3], atol=1e-6)
@@ -98,14 +106,14 @@ def test_every_number_is_of_the_pixel_its_ray_goes_through(batch: Batch, frames:
             of_ray = m - numbers.start - (r - rays.start) * sensor.channel_count  # which of the ray's numbers, without a mosaic
             if sensor.mosaic is not None:
                 channel = int(channel_map(sensor.mosaic, 18, 24)[row, column])
-                assert float(batch.target[m]) == pixel
+                assert float(batch.measured.target[m]) == pixel
             else:
                 channel = of_ray
-                assert float(batch.target[m]) == pixel[channel]
+                assert float(batch.measured.target[m]) == pixel[channel]
             seen.add(channel)
             if sensor.is_polarization:
-                assert int(batch.output[m]) == COLUMNS[name].start
-                axis = batch.axes[m - (len(batch.ray) - len(batch.axes))].double().numpy()
+                assert int(batch.measured.output[m]) == COLUMNS[name].start
+                axis = batch.measured.axes[m - (len(batch.measured.ray) - len(batch.measured.axes))].double().numpy()
                 # seen along the ray: the camera's x axis turned towards image up by the analyser's angle
                 angle = np.deg2rad(sensor.polarizer_angles_deg[channel])
                 x = frame.camera_to_world[:3, 0]
@@ -115,7 +123,7 @@ def test_every_number_is_of_the_pixel_its_ray_goes_through(batch: Batch, frames:
                 assert up @ frame.camera_to_world[:3, 1] < 0  # image down is y
                 np.testing.assert_allclose(axis, np.cos(angle) * x + np.sin(angle) * up, atol=1e-6)
             else:
-                assert int(batch.output[m]) == COLUMNS[name].start + channel
+                assert int(batch.measured.output[m]) == COLUMNS[name].start + channel
         assert len(seen) == sensor.channel_count
         begin += FRAMES
 
@@ -123,16 +131,16 @@ def test_every_number_is_of_the_pixel_its_ray_goes_through(batch: Batch, frames:
 def test_levels_saturations_and_weights_are_the_modalitys(batch: Batch, measurements: dict[str, Measurements]) -> None:
     for name, (_, numbers) in batch.parts.items():
         m = measurements[name]
-        assert (batch.level[numbers] == np.float32(m.radiance_scale)).all()
+        assert (batch.measured.level[numbers] == np.float32(m.radiance_scale)).all()
         assert m.radiance_scale == pytest.approx(BRIGHTNESS[name] / 2, rel=0.05)
-        assert (batch.saturation[numbers] == np.float32(m.sensor.saturation)).all()
-    assert float(batch.weight.sum()) == pytest.approx(1.0)
+        assert (batch.measured.saturation[numbers] == np.float32(m.sensor.saturation)).all()
+    assert float(batch.measured.weight.sum()) == pytest.approx(1.0)
 
 
 def test_a_batch_without_polarization_has_no_axes(measurements: dict[str, Measurements]) -> None:
     names = ("rgb", "mono")
     batch = draw({n: measurements[n] for n in names}, COLUMNS, dict.fromkeys(names, 5), np.random.default_rng(0), CPU)
-    assert batch.axes.shape == (0, 3)
+    assert batch.measured.axes.shape == (0, 3)
     outputs = torch.randn(10, 19)
     torch.testing.assert_close(predict(outputs, torch.ones(10), batch.measured), _predicted_plainly(outputs, torch.ones(10), batch))
     only = draw({"pol": measurements["pol"]}, COLUMNS, {"pol": 5}, np.random.default_rng(0), CPU)
@@ -141,22 +149,26 @@ def test_a_batch_without_polarization_has_no_axes(measurements: dict[str, Measur
 
 def test_the_same_random_state_draws_the_same_batch(measurements: dict[str, Measurements]) -> None:
     a, b, c = (draw(measurements, COLUMNS, RAYS, np.random.default_rng(seed), CPU) for seed in (1, 1, 2))
-    assert torch.equal(a.target, b.target) and torch.equal(a.axes, b.axes) and not torch.equal(a.target, c.target)
+    assert (
+        torch.equal(a.measured.target, b.measured.target)
+        and torch.equal(a.measured.axes, b.measured.axes)
+        and not torch.equal(a.measured.target, c.measured.target)
+    )
 
 
 def _predicted_plainly(outputs: torch.Tensor, opacity: torch.Tensor, batch: Batch) -> torch.Tensor:
     """One number after the other."""
-    found, bright = [], len(batch.ray) - len(batch.axes)
-    for m, (ray, output) in enumerate(zip(batch.ray.tolist(), batch.output.tolist(), strict=True)):
+    found, bright = [], len(batch.measured.ray) - len(batch.measured.axes)
+    for m, (ray, output) in enumerate(zip(batch.measured.ray.tolist(), batch.measured.output.tolist(), strict=True)):
         if m < bright:
             light = np.log1p(np.exp(float(outputs[ray, output])))
         else:
             a, b, c, d, e, f = outputs[ray, output : output + 6].double().tolist()
             a, b, c = (np.log1p(np.exp(x)) for x in (a, b, c))
             factor = np.array([[a, 0, 0], [d, b, 0], [e, f, c]])
-            axis = batch.axes[m - bright].double().numpy()
+            axis = batch.measured.axes[m - bright].double().numpy()
             light = axis @ factor @ factor.T @ axis
-        found.append(light * float(batch.level[m]) * float(opacity[ray]))
+        found.append(light * float(batch.measured.level[m]) * float(opacity[ray]))
     return torch.tensor(found, dtype=torch.float32)
 
 
@@ -169,24 +181,24 @@ def test_predictions_are_the_formulas_of_each_modality(batch: Batch) -> None:
     # what a ray did not measure is not pulled at
     found.sum().backward()
     touched = torch.zeros(rays, 19, dtype=torch.bool)
-    bright = len(batch.ray) - len(batch.axes)
-    touched[batch.ray[:bright], batch.output[:bright]] = True
+    bright = len(batch.measured.ray) - len(batch.measured.axes)
+    touched[batch.measured.ray[:bright], batch.measured.output[:bright]] = True
     for k in range(6):
-        touched[batch.ray[bright:], batch.output[bright:] + k] = True
+        touched[batch.measured.ray[bright:], batch.measured.output[bright:] + k] = True
     assert not outputs.grad[~touched].any() and (outputs.grad[touched] != 0).float().mean() > 0.99
     assert (opacity.grad > 0).all()
 
 
 def test_the_loss_is_a_mean_over_modalities_of_hubers_of_relative_residuals(batch: Batch) -> None:
     torch.manual_seed(1)
-    predicted = batch.target + torch.randn_like(batch.target) * batch.level
+    predicted = batch.measured.target + torch.randn_like(batch.measured.target) * batch.measured.level
     total = 0.0
     for name, (_, numbers) in batch.parts.items():
         sensor = next(s for s in SENSORS if s.name == name)
-        p, t = predicted[numbers].double().numpy(), batch.target[numbers].double().numpy()
+        p, t = predicted[numbers].double().numpy(), batch.measured.target[numbers].double().numpy()
         difference = p - t
         difference[(t >= sensor.saturation) & (difference > 0)] = 0  # clipped: at least this much
-        relative = np.abs(difference) / float(batch.level[numbers][0])
+        relative = np.abs(difference) / float(batch.measured.level[numbers][0])
         huber = np.where(relative < 0.5, 0.5 * relative**2, 0.5 * (relative - 0.25))
         total += huber.mean() / len(batch.parts)
     assert float(photometric(residual(predicted, batch.measured), batch.measured)) == pytest.approx(total, rel=1e-5)
@@ -196,10 +208,10 @@ def _alone(target: list[float], saturation: float, level: float) -> Batch:
     count = len(target)
     full = lambda value: torch.full((count,), value)
     number = torch.arange(count)
-    return Batch(
-        torch.zeros(count, 3), torch.zeros(count, 3), torch.tensor(target), number, 0 * number, torch.empty(0, 3), full(level),
-        full(saturation), full(1 / count), 0 * number, {"mono": (slice(0, count), slice(0, count))}, full(float("nan")),
-    )  # fmt: skip
+    output, no_axes = 0 * number, torch.empty(0, 3)
+    measured = Measured(torch.tensor(target), number, output, no_axes, full(level), full(saturation), full(1 / count))
+    parts = {"mono": (slice(0, count), slice(0, count))}
+    return Batch(torch.zeros(count, 3), torch.zeros(count, 3), measured, 0 * number, parts, full(float("nan")))
 
 
 def test_saturated_targets_only_pull_upwards() -> None:

@@ -395,7 +395,7 @@ def test_black_pixels_of_a_black_scene_ask_for_emptiness(tmp_path: Path) -> None
     with torch.no_grad():  # all opaque, so that there is something to lose
         trainer.field.surface.output_weight[-1] = -0.6
     opacity = _opacity(trainer, batch)
-    black = batch.target.reshape(400, 3).amax(1) == 0
+    black = batch.measured.target.reshape(400, 3).amax(1) == 0
     assert 50 < black.sum() < 350 and (opacity[black] > 0.5).sum() > 50
     more = _loss(trainer, batch, **{"loss.background_opacity_weight": 0.5, "loss.eikonal_weight": 0.0}) - _loss(
         trainer, batch, **{"loss.background_opacity_weight": 0.0, "loss.eikonal_weight": 0.0}

@@ -196,11 +196,11 @@ def _batch(target: list[float], saturation: float) -> Batch:
     """One ray behind four analysers."""
     d, x = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0]])
     axes = analyser_axes(d, x, torch.deg2rad(torch.tensor([ANGLES])))[0]
-    four = torch.full((4,), 1.0)
+    four, zeros = torch.ones(4), torch.zeros(4, dtype=torch.int64)
     return Batch(
-        origins=torch.zeros(1, 3), directions=d, ray=torch.zeros(4, dtype=torch.int64), target=torch.tensor(target),
-        output=torch.zeros(4, dtype=torch.int64), axes=axes, level=four, saturation=saturation * four, weight=0.25 * four,
-        frame=torch.zeros(4, dtype=torch.int64), parts={"pol": (slice(0, 1), slice(0, 4))}, alpha=torch.full((1,), torch.nan),
+        origins=torch.zeros(1, 3), directions=d,
+        measured=kernels.Measured(torch.tensor(target), zeros, zeros, axes, four, saturation * four, 0.25 * four),
+        frame=zeros, parts={"pol": (slice(0, 1), slice(0, 4))}, alpha=torch.full((1,), torch.nan),
     )  # fmt: skip
 
 

@@ -41,7 +41,10 @@ def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
     """The trainer's loss by single operations, of a batch with the bad pixel, and torch's Adam: share of residuals NaN before and after."""
     field, batches = trainer.field, (np.random.default_rng(seed) for seed in range(1000))
     batch = next(
-        b for r in batches for b in [draw(trainer.measurements, field.shader.columns, {"rgb": 128}, r, "cpu")] if b.target.isnan().any()
+        b
+        for r in batches
+        for b in [draw(trainer.measurements, field.shader.columns, {"rgb": 128}, r, "cpu")]
+        if b.measured.target.isnan().any()
     )
     o, d, zero = batch.origins, batch.directions, torch.zeros(128)
     sampling, optimiser, lost = sampling_at(0.0, trainer.recipe, trainer.needs), torch.optim.Adam(field.parameters(), 1e-3), []
