@@ -255,6 +255,9 @@ def _result(estimate: Estimate, d: Values, factor: int, black_dn: float, prnu: f
     told = constant > 2.0 * spread
     slope = estimate.covariance_of("slope")
     read = float(constant**0.5 / gain)
+    # the curve: bins of as many values each, on plain surfaces; their variance by the median of squares
+    plain = d[d.activity < 4.0 * p.variance(d.mean)] if factor > 1 else d
+    parts = [part for part in np.array_split(np.argsort(plain.mean), _BINS) if len(part) >= 30]
     relative = estimate.covariance_of("constant") / 4.0 - estimate.covariance_of("constant", "slope") + slope
     return PhotonTransfer(
         gain_dn_e=float(gain),
@@ -263,7 +266,8 @@ def _result(estimate: Estimate, d: Values, factor: int, black_dn: float, prnu: f
         read_sd=float(read * max(relative, 0.0) ** 0.5) if told else float((2.0 * spread) ** 0.5 / gain),
         prnu=prnu,
         prnu_sd=prnu_sd,
-        **_curve(p, d, factor, black_dn),
+        mean_dn=np.array([plain.mean[part].mean() + black_dn for part in parts]),
+        variance_dn2=np.array([np.median(plain.value[part] ** 2) / (_MEDIAN_OF_SQUARE * factor) for part in parts]),
     )
 
 
@@ -284,12 +288,3 @@ def _spread_at_zero(p: Parameters, d: Values, factor: int) -> float:
     basis = np.stack([np.ones_like(d.mean), d.mean], 1) / p.variance(d.mean)[:, None]
     overlap = 1.0 if factor == 1 else 4.0  # second differences along two axes share photosites
     return float(np.sqrt(np.linalg.inv(0.5 * basis.T @ basis / overlap)[0, 0]))
-
-
-def _curve(p: Parameters, d: Values, factor: int, black_dn: float) -> dict[str, np.ndarray]:
-    """Mean and variance of bins of as many values each, on plain surfaces; by the median of squares."""
-    plain = d[d.activity < 4.0 * p.variance(d.mean)] if factor > 1 else d
-    parts = [part for part in np.array_split(np.argsort(plain.mean), _BINS) if len(part) >= 30]
-    means = np.array([plain.mean[part].mean() + black_dn for part in parts])
-    variances = np.array([np.median(plain.value[part] ** 2) / (_MEDIAN_OF_SQUARE * factor) for part in parts])
-    return {"mean_dn": means, "variance_dn2": variances}
