@@ -194,7 +194,7 @@ def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
     wrong = {"mono": lambda _: picture(poses["mono"][0], 0.5).mean(-1)}
     psnr: dict[str, list[float]] = {"joint": [], "ours": []}
     for seed in range(3):
-        for name, below in (("joint", 0.0), ("ours", QUICK.sparse_below)):
+        for name, below in (("joint", 0.0), ("ours", QUICK.sampling.sparse_below)):
             folder = write_scene(tmp_path / "scene", poses, alter=wrong)
             recipe = QUICK.with_changes({"sampling.sparse_below": below})
             field = fit(load_scene(folder), tmp_path / "run", recipe=recipe, steps=200, seed=seed)
