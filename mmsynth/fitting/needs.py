@@ -37,7 +37,7 @@ class Needs:
         black_background: whether black pixels say that nothing is there.
         sparse: modalities with so few pixels that they would spoil what others know better: they learn their colours from the
             geometry and appearance of the others. share: of the rays that each modality gets, relative to a plentiful one.
-        choices: by name, those made so far; what is decided later is added.
+        choices: by name; what is decided later is in ``Trainer.choices``.
     """
 
     design: Design

@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +134,7 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
             "test_views": list(scene.split.test),
         },
         "recipe": trainer.recipe.model_dump(),
-        "needs": asdict(trainer.needs),
+        "needs": asdict(replace(trainer.needs, choices=trainer.choices)),
         "exposure": trainer.gains(),
         "poses": _poses(trainer, scene),
         "seed": trainer.seed,

@@ -17,6 +17,7 @@ from mmsynth.errors import DivergedError, InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
 from mmsynth.fitting import losses
+from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
 from mmsynth.fitting.motions import RayJacobian
@@ -95,7 +96,6 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.needs.choices.update(self.refinement.choices)
         self.has_alpha = any(m.has_alpha for m in self.measurements.values())
         self.parts: dict[str, Any] = {
             "field": self.field,
@@ -111,61 +111,89 @@ class Trainer:
             return min(1.0, self.state.step / self.steps)
         return min(1.0, self.state.elapsed / self.budget)  # type: ignore[operator]
 
+    @property
+    def choices(self) -> dict[str, Choice[Any]]:
+        """All choices made so far and why, by name."""
+        tables, decided = self.state.tables, self.state.decided
+        return {
+            **self.needs.choices,
+            **({} if tables is None else {"tables": tables.choice}),
+            **self.refinement.choices,
+            **({} if decided is None else decided.choices),
+        }
+
     def run_step(self) -> None:
         """One optimiser step."""
-        state, recipe, field = self.state, self.recipe, self.field
+        state = self.state
         random = np.random.default_rng((self.seed, 1, state.step))
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
-        sampling = sampling_at(self.progress, recipe, self.needs)
-        if state.step % recipe.sampling.occupancy_every == 0:
-            share = 1.0 if state.step == 0 else 1 / 16
-            sdf = lambda x: field.surface(x, sampling.active_surface)
-            if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
-                state.reopened += 1
-        if state.tables is None and 0 < recipe.schedule.tables_at <= self.progress:
-            state.tables = size_tables(field, recipe, sampling, generator)
-            self._resize_tables(state.tables, generator)
-        if state.decided is None:
-            # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
-            seen = 0 if self.progress < recipe.schedule.view_dependence_from else DEGREES
-            field.view_dependence.update(dict.fromkeys(self.measurements, seen))
-            if self.progress >= recipe.schedule.decide_at:
-                state.decided = decide(field, self.measurements, recipe.radiance, sampling, self.seed)
-                self._take(state.decided)
-        if self.refinement.due(self.progress):
-            self.refinement.step(functools.partial(self._look, sampling), self.progress)
-            self.needs.choices.update(self.refinement.choices)
-        total = sum(self.needs.share.values())
-        rays = {n: max(1, int(state.rays * share / total)) for n, share in self.needs.share.items()}
-        batch = draw(self.measurements, field.shader.columns, rays, random, self.device)
+        sampling = sampling_at(self.progress, self.recipe, self.needs)
+        self._prepare(sampling, generator)
+        batch = self._draw(random)
         loss, errors, samples = self._loss(batch, sampling, generator)
-        if not bool(torch.isfinite(loss)):
-            self._skip("the loss is not finite")
+        wrong = self._differentiate(loss)
+        if wrong is not None:
+            self._skip(wrong)
             return
-        loss.backward()
-        # what is NaN in a sample is NaN in a sum
-        if not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
-            self.optimiser.clear()
-            self._skip("a gradient is not finite")
-            return
-        slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, recipe))
-        surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
-        rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
-        self.optimiser.step(learning_rate_factor(self.progress, recipe), slower, rows)
+        self._update(sampling)
         keep = 0.98 if state.step else 0.0
         value = float(loss.detach())
         state.mean_loss = value if math.isnan(state.mean_loss) else keep * state.mean_loss + (1 - keep) * value  # nan: all were skipped
         for name, error in errors.items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
-        done = self.progress
-        if recipe.schedule.ema_fraction > 0 and done >= 1.0 - 4.0 * recipe.schedule.ema_fraction and state.step % _AVERAGE_EVERY == 0:
-            self.average.update(recipe.schedule.ema_fraction * state.step / max(done, 1e-9) / _AVERAGE_EVERY)
         state.rays_total += len(batch.origins)
         state.samples_total += samples
         # a fixed number of samples a step; the number of rays follows, by at most a factor of two either way
-        ratio = min(2.0, max(0.5, recipe.sampling.samples_per_step / max(samples, 1)))
+        ratio = min(2.0, max(0.5, self.recipe.sampling.samples_per_step / max(samples, 1)))
         state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
         state.step += 1
+
+    def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
+        """What is due before a step: the occupancy grid, the rows of the tables, what residuals decide, the poses."""
+        state, schedule, field = self.state, self.recipe.schedule, self.field
+        if state.step % self.recipe.sampling.occupancy_every == 0:
+            share = 1.0 if state.step == 0 else 1 / 16
+            sdf = lambda x: field.surface(x, sampling.active_surface)
+            if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
+                state.reopened += 1
+        if state.tables is None and 0 < schedule.tables_at <= self.progress:
+            state.tables = size_tables(field, self.recipe, sampling, generator)
+            self._resize_tables(state.tables, generator)
+        if state.decided is None:
+            # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
+            seen = 0 if self.progress < schedule.view_dependence_from else DEGREES
+            field.view_dependence.update(dict.fromkeys(self.measurements, seen))
+            if self.progress >= schedule.decide_at:
+                state.decided = decide(field, self.measurements, self.recipe.radiance, sampling, self.seed)
+                self._see_directions(state.decided)
+        if self.refinement.due(self.progress):
+            self.refinement.step(functools.partial(self._look, sampling), self.progress)
+
+    def _draw(self, random: np.random.Generator) -> Batch:
+        total = sum(self.needs.share.values())
+        rays = {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
+        return draw(self.measurements, self.field.shader.columns, rays, random, self.device)
+
+    def _differentiate(self, loss: torch.Tensor) -> str | None:
+        """Gradients of the loss; what is wrong where it or they are not finite, and then no gradient is left."""
+        if not bool(torch.isfinite(loss)):
+            return "the loss is not finite"
+        loss.backward()
+        # what is NaN in a sample is NaN in a sum
+        if not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
+            self.optimiser.clear()
+            return "a gradient is not finite"
+        return None
+
+    def _update(self, sampling: kernels.Sampling) -> None:
+        """A step of the optimiser, and of the mean over the last parameters."""
+        field, done, length = self.field, self.progress, self.recipe.schedule.ema_fraction
+        slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
+        surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
+        rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
+        self.optimiser.step(learning_rate_factor(done, self.recipe), slower, rows)
+        if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
+            self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
     def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
         recipe, field = self.recipe, self.field
@@ -183,10 +211,8 @@ class Trainer:
             known = torch.isfinite(batch.alpha)
             loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(jitter)
         elif self.needs.black_background:
-            black = (
-                torch.zeros_like(hits.opacity).scatter_reduce(0, batch.measured.ray, batch.measured.target / batch.measured.level, "amax")
-                < 0.02
-            )
+            m = batch.measured
+            black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
             loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
             loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, batch, sampling, generator))
@@ -214,11 +240,9 @@ class Trainer:
         for name, rows in kept.items():
             self.optimiser.resize(name, rows)
             self.average.resize(name, rows)
-        self.needs.choices["tables"] = sizes.choice
 
-    def _take(self, decisions: Decisions) -> None:
+    def _see_directions(self, decisions: Decisions) -> None:
         self.field.view_dependence.update({name: choice.value for name, choice in decisions.view_dependence.items()})
-        self.needs.choices.update(decisions.choices)
 
     def _gradients(self, hits: kernels.Hits, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> torch.Tensor:
         """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""
@@ -278,9 +302,8 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
-        self.needs.choices.update(self.refinement.choices)
         if self.state.decided is not None:
-            self._take(self.state.decided)
+            self._see_directions(self.state.decided)
 
     def _task(self) -> dict[str, Any]:
         """What a checkpoint must agree on to be resumed: hash of the pixels and poses, recipe, seed, length."""

@@ -76,20 +76,20 @@ def _fitted(scene: Scene, steps: int = 260, **recipe: object) -> Trainer:
 def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> None:
     trainer = _fitted(_scene(tmp_path / "s"))
     assert not trainer.needs.design.background and trainer.field.surface.grid.extent == 1.0
-    assert trainer.field.view_dependence == {"rgb": 0}, trainer.needs.choices
-    assert trainer.gains() == {}, trainer.needs.choices
+    assert trainer.field.view_dependence == {"rgb": 0}, trainer.choices
+    assert trainer.gains() == {}, trainer.choices
     assert trainer.needs.sparse == ()
-    assert trainer.field.far_light is None and trainer.needs.choices["far_light"].why.startswith("off")
+    assert trainer.field.far_light is None and trainer.choices["far_light"].why.startswith("off")
     assert trainer.field.shader.heads.out_features == 3  # no tensor head
-    assert trainer.needs.choices["tensor_head"].why.startswith("off")
+    assert trainer.choices["tensor_head"].why.startswith("off")
     assert trainer.report().psnr["rgb"] > 25  # the decisions are about a fit that works
 
 
 def test_a_glossy_ball_in_a_painted_room_gets_what_it_needs(tmp_path: Path) -> None:
     trainer = _fitted(_scene(tmp_path / "s", gloss=0.5, room=1.0))
     assert trainer.needs.design.background and trainer.field.surface.grid.extent == 2.0
-    assert trainer.field.view_dependence["rgb"] > 0, trainer.needs.choices
-    assert trainer.gains() == {}, trainer.needs.choices
+    assert trainer.field.view_dependence["rgb"] > 0, trainer.choices
+    assert trainer.gains() == {}, trainer.choices
 
 
 def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
@@ -106,8 +106,8 @@ def _past_the_ball(trainer: Trainer, scene: Scene) -> float:
 def test_a_dim_room_is_a_colour_per_direction_and_not_a_surface(tmp_path: Path) -> None:
     scene = _scene(tmp_path / "s", room=0.2)
     trainer, without = _fitted(scene), _fitted(scene, **{"radiance.far_light": "off"})
-    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.needs.choices
-    assert without.field.far_light is None and "asked for by the recipe" in without.needs.choices["far_light"].why
+    assert trainer.needs.design.far_light and not trainer.needs.design.background, trainer.choices
+    assert without.field.far_light is None and "asked for by the recipe" in without.choices["far_light"].why
     assert _past_the_ball(trainer, scene) < 0.5 * _past_the_ball(without, scene)
     # and it is still known after it was stored
     trainer.field.sampling = sampling_at(1.0, trainer.recipe, trainer.needs)
@@ -129,14 +129,14 @@ def test_frames_of_different_exposure_get_gains_and_the_gains_are_right(tmp_path
     error = np.sqrt(np.square(np.log(found / true)).mean())
     assert error < 0.4 * np.sqrt(np.square(np.log(true)).mean()), (found, true)
     forced = _fitted(scene, steps=40, **{"radiance.exposure": "off"})
-    assert forced.gains() == {} and "asked for by the recipe" in forced.needs.choices["exposure"].why
+    assert forced.gains() == {} and "asked for by the recipe" in forced.choices["exposure"].why
 
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_the_recipe_can_force_the_degree_of_view_dependence(tmp_path: Path, degree: int) -> None:
     trainer = _fitted(_scene(tmp_path / "s"), steps=20, **{"radiance.view_dependence": degree})
     assert trainer.field.view_dependence == {"rgb": degree}
-    assert "asked for by the recipe" in trainer.needs.choices["view_dependence.rgb"].why
+    assert "asked for by the recipe" in trainer.choices["view_dependence.rgb"].why
 
 
 def _needs(scene: Scene, **recipe: object) -> Needs:

@@ -82,8 +82,8 @@ def test_exact_poses_are_left_alone(scene: Scene) -> None:
     trainer = Trainer(scene, _recipe(), STEPS, None, 0, "cpu")
     before = {n: (m.rotations.copy(), m.origins.copy()) for n, m in trainer.measurements.items()}
     _run(trainer, 0.6)
-    assert not trainer.refinement.decided.views.value and not trainer.refinement.decided.rig.value, trainer.needs.choices
-    assert trainer.needs.choices["poses"].why.startswith("off: motions of views would save")
+    assert not trainer.refinement.decided.views.value and not trainer.refinement.decided.rig.value, trainer.choices
+    assert trainer.choices["poses"].why.startswith("off: motions of views would save")
     for name, m in trainer.measurements.items():
         assert np.array_equal(m.rotations, before[name][0]) and np.array_equal(m.origins, before[name][1])
     assert trainer.refinement.corrections().views == {} and trainer.refinement.sizes() == {"views": {}, "sensors": {}}
@@ -160,18 +160,18 @@ def test_a_broken_off_refinement_goes_on_to_the_same_field(scene: Scene, tmp_pat
     assert np.array_equal(after.refinement.motions.sensors, whole.refinement.motions.sensors)
     for name, tensor in whole.field.state_dict().items():
         assert torch.equal(tensor, after.field.state_dict()[name]), name
-    assert after.needs.choices == whole.needs.choices
+    assert after.choices == whole.choices
 
 
 def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
     forced = _run(Trainer(scene, _recipe(**{"poses.views": "on", "poses.rig": "off", "poses.start_at": 0.0}), 20, None, 0, "cpu"))
     assert forced.refinement.decided is not None
     assert forced.refinement.decided.views.value and not forced.refinement.decided.rig.value
-    assert "asked for by the recipe" in forced.needs.choices["poses"].why and "asked for by the recipe" in forced.needs.choices["rig"].why
+    assert "asked for by the recipe" in forced.choices["poses"].why and "asked for by the recipe" in forced.choices["rig"].why
     alone = dataclasses.replace(scene, split=dataclasses.replace(scene.split, train=scene.split.train[:1]))
     one = _run(Trainer(alone, _recipe(**{"poses.views": "on", "poses.start_at": 0.0}), 10, None, 0, "cpu"))
     assert one.refinement.decided is not None and not one.refinement.decided.views.value
-    assert one.needs.choices["poses"].why == "off: there is one view"
+    assert one.choices["poses"].why == "off: there is one view"
     single = Trainer(
         load_scene(data_folder("example_scene"), modalities=["rgb"]),
         _recipe(**{"poses.rig": "on", "poses.views": "off"}),
@@ -180,7 +180,7 @@ def test_the_recipe_forces_and_what_cannot_move_does_not(scene: Scene) -> None:
         0,
         "cpu",
     )
-    assert single.needs.choices["rig"].why == "off: no two sensors share views"
+    assert single.choices["rig"].why == "off: no two sensors share views"
 
 
 def test_the_choice_is_in_the_manifest_and_the_checkpoint(scene: Scene, tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_levels_in_use_keep_their_rows() -> None:
 def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
     trainer = Trainer(scene, Recipe().with_changes(SMALL), 16, None, 0, "cpu")
     assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
-    assert "tables" not in trainer.needs.choices
+    assert "tables" not in trainer.choices
     while trainer.progress < 0.125:
         trainer.run_step()
     coarse = int(trainer.field.appearance.offsets[2])
@@ -115,7 +115,7 @@ def test_a_fit_sizes_its_finer_levels_once_and_says_so(scene: Scene) -> None:
     sampling, generator = sampling_at(trainer.progress, trainer.recipe, trainer.needs), torch.Generator().manual_seed(0)
     trainer.state.tables = size_tables(trainer.field, trainer.recipe, sampling, generator)
     trainer._resize_tables(trainer.state.tables, generator)
-    design, evidence = trainer.field.design, trainer.needs.choices["tables"].why
+    design, evidence = trainer.field.design, trainer.choices["tables"].why
     assert isinstance(design.radiance_rows_log2, tuple) and design.radiance_rows_log2[:2] == (17, 17)
     fine = design.radiance_rows_log2[-1]
     assert 12 <= fine < 17 and f"radiance 2^{fine} for" in evidence and "no more" not in evidence.split("radiance")[1]
@@ -145,7 +145,7 @@ def test_a_small_object_gets_smaller_tables_than_a_large_one(scene: Scene) -> No
 def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
     trainer = Trainer(scene, Recipe().with_changes({**SMALL, "schedule.tables_at": 0.0}), 8, None, 0, "cpu")
     assert trainer.field.design.surface_rows_log2 == 16 and trainer.field.design.radiance_rows_log2 == 17
-    assert "asked for by the recipe" in trainer.needs.choices["tables"].why
+    assert "asked for by the recipe" in trainer.choices["tables"].why
     design = trainer.field.design
     while trainer.progress < 1:
         trainer.run_step()

@@ -475,12 +475,12 @@ def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, monkeypa
 
 def test_only_needed_parts_are_built(scene: Scene) -> None:
     trainer = _trainer(scene)
-    assert not trainer.field.design.background and trainer.needs.choices["background"].why.startswith("off")
+    assert not trainer.field.design.background and trainer.choices["background"].why.startswith("off")
     forced = _trainer(scene, **{"surface.background": "on"})
-    assert forced.field.design.background and "asked for by the recipe" in forced.needs.choices["background"].why
+    assert forced.field.design.background and "asked for by the recipe" in forced.choices["background"].why
     assert forced.field.surface.grid.extent == forced.field.appearance.extent == forced.field.occupancy.extent == 2.0
     rgb = load_scene(data_folder("example_scene"), modalities=["rgb"])
-    assert _trainer(rgb).needs.choices["tensor_head"].why.startswith("off")
+    assert _trainer(rgb).choices["tensor_head"].why.startswith("off")
 
 
 def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene) -> None:
