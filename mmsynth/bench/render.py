@@ -1,8 +1,8 @@
 """``mmsynth bench render``: rays per second of a fitted field against error, by what a ray is sampled with and what is asked of it.
 
 The error is that of sampling alone: each way to render is judged by a fine rendering of the same field, which single operations of
-torch make from rays that are never cut off, not by the kernel that is timed. Ways take turns, see ``methods``. To add a way, add a
-``Way`` to its family.
+torch make from rays that are never cut off, not by the kernel that is timed. Variants take turns, see ``methods``. To add one, add a
+``Variant`` to its family.
 """
 
 from __future__ import annotations
@@ -59,16 +59,16 @@ class Rays:
 
 @dataclass(frozen=True)
 class Truth:
-    """The reference: outputs, of all modalities and with geometry; samples: taken per ray; doubt: how far a reference of twice the
+    """The reference: outputs, of all modalities and with geometry; samples: taken per ray; error: how far a reference of twice the
     step is from it, root mean square in parts of full scale."""
 
     outputs: Outputs
     samples: float
-    doubt: float
+    error: float
 
 
 @dataclass(frozen=True)
-class Bed:
+class RenderCase:
     """What all families render: a field's rays, and what is right for them."""
 
     field: Field
@@ -83,7 +83,7 @@ class Bed:
 
 
 @dataclass(frozen=True)
-class Way:
+class Variant:
     """One way to render: with a sampling, by tiles of so many rays, on ``threads`` (None: those of the bench)."""
 
     problem: str
@@ -157,12 +157,12 @@ def _joined(parts: Sequence[Outputs]) -> Outputs:
 # --- rendering and judging
 
 
-def render(bed: Bed, way: Way) -> Outputs:
+def render(case: RenderCase, variant: Variant) -> Outputs:
     """All rays, the way an operation has them rendered."""
-    field = copy.copy(bed.field)  # its tensors are shared
-    field.sampling = way.sampling
-    with use_threads(way.threads):
-        return _joined([field.render_rays(*tile, way.modalities, way.geometry) for tile in bed.rays.tiles(way.tile)])
+    field = copy.copy(case.field)  # its tensors are shared
+    field.sampling = variant.sampling
+    with use_threads(variant.threads):
+        return _joined([field.render_rays(*tile, variant.modalities, variant.geometry) for tile in case.rays.tiles(variant.tile)])
 
 
 def difference(found: Outputs, truth: Outputs, modalities: Sequence[str]) -> dict[str, float]:
@@ -185,29 +185,31 @@ def shape_difference(found: Outputs, truth: Outputs) -> dict[str, float]:
     return out | {"depth": float(((depth - true).abs() / true).median()), "normal": float(torch.rad2deg(turned).median())}
 
 
-def judge(bed: Bed, way: Way, found: Outputs) -> dict[str, float]:
+def judge(case: RenderCase, variant: Variant, found: Outputs) -> dict[str, float]:
     """Radiance of what was rendered; depth, normals and samples per ray of its rays, whether they were asked for or not."""
-    whole = render(bed, dataclasses.replace(way, modalities=[], geometry=True))
-    radiance = difference(found, bed.truth.outputs, way.modalities) if way.modalities else {}
-    return radiance | shape_difference(whole, bed.truth.outputs) | {"samples": _samples(bed, way)}
+    whole = render(case, dataclasses.replace(variant, modalities=[], geometry=True))
+    radiance = difference(found, case.truth.outputs, variant.modalities) if variant.modalities else {}
+    return radiance | shape_difference(whole, case.truth.outputs) | {"samples": _samples(case, variant)}
 
 
 @torch.no_grad()
-def _samples(bed: Bed, way: Way) -> float:
-    field, total = bed.field, 0
-    for origins, directions, _ in bed.rays.tiles(TILE):
+def _samples(case: RenderCase, variant: Variant) -> float:
+    field, total = case.field, 0
+    for origins, directions, _ in case.rays.tiles(TILE):
         middle = torch.full((len(origins),), 0.5)
-        total += int(rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, way.sampling).samples)
-    return total / len(bed.rays)
+        total += int(
+            rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, variant.sampling).samples
+        )
+    return total / len(case.rays)
 
 
 # --- families
 
 
-def _ways(bed: Bed, variants: Mapping[str, Mapping[str, Any]]) -> list[Way]:
+def _variants(case: RenderCase, variants: Mapping[str, Mapping[str, Any]]) -> list[Variant]:
     """For one modality and for all, one of each name, which differs from the field's own way by some figures."""
-    own = {"sampling": bed.field.sampling}
-    return [Way(problem, name, names, **{**own, **change}) for problem, names in bed.sets.items() for name, change in variants.items()]
+    own = {"sampling": case.field.sampling}
+    return [Variant(problem, name, names, **{**own, **change}) for problem, names in case.sets.items() for name, change in variants.items()]
 
 
 def _values(sampling: Sampling, key: str, values: Sequence[float]) -> dict[str, dict[str, Sampling]]:
@@ -220,36 +222,38 @@ def _own(yes: bool) -> str:
     return " (the field's)" if yes else ""
 
 
-def termination(bed: Bed) -> list[Way]:
+def termination(case: RenderCase) -> list[Variant]:
     """The optical depth at which a ray ends."""
-    return _ways(bed, _values(bed.field.sampling, "max_optical_depth", (1.0, 2.0, 3.0, 5.0, 8.0)))
+    return _variants(case, _values(case.field.sampling, "max_optical_depth", (1.0, 2.0, 3.0, 5.0, 8.0)))
 
 
-def steps(bed: Bed) -> list[Way]:
+def steps(case: RenderCase) -> list[Variant]:
     """How a ray is sampled: the step at the surface, the stride towards it, and how much a section weighs that has its own appearance."""
-    s = bed.field.sampling
+    s = case.field.sampling
     lengths = {f"step x {v:g}{_own(v == 1.0)}": {"sampling": s._replace(step=v * s.step)} for v in (0.5, 1.0, 2.0, 4.0)}
     strides, weights = _values(s, "sphere_step_factor", (0.4, 0.7, 0.9)), _values(s, "min_section_weight", (0.0, 1e-2, 5e-2))
-    return _ways(bed, lengths | strides | weights)
+    return _variants(case, lengths | strides | weights)
 
 
-def asked(bed: Bed) -> list[Way]:
+def asked(case: RenderCase) -> list[Variant]:
     """What is asked for: each modality alone and all of them, with normals and without, and the surface alone; depth comes with all."""
-    s, names = bed.field.sampling, list(bed.field.sensors)
-    sets = {name: [name] for name in names} | bed.sets | {"depth": []}
-    return [Way("all rays", f"{name}{', normals' * shape}", chosen, s, shape) for name, chosen in sets.items() for shape in (False, True)]
+    s, names = case.field.sampling, list(case.field.sensors)
+    sets = {name: [name] for name in names} | case.sets | {"depth": []}
+    return [
+        Variant("all rays", f"{name}{', normals' * shape}", chosen, s, shape) for name, chosen in sets.items() for shape in (False, True)
+    ]
 
 
-def tiles(bed: Bed) -> list[Way]:
+def tiles(case: RenderCase) -> list[Variant]:
     """Rays per tile."""
-    return _ways(bed, {f"{size} rays{_own(size == TILE)}": {"tile": size} for size in (1024, 4096, 8192, 16384, 65536)})
+    return _variants(case, {f"{size} rays{_own(size == TILE)}": {"tile": size} for size in (1024, 4096, 8192, 16384, 65536)})
 
 
-def threads(bed: Bed) -> list[Way]:
+def threads(case: RenderCase) -> list[Variant]:
     """Threads, from one to as many as numba was started with, by doubling."""
     most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     counts = sorted({*(2**i for i in range(most.bit_length()) if 2**i <= most), most})
-    return _ways(bed, {f"{n} threads": {"threads": n} for n in counts})
+    return _variants(case, {f"{n} threads": {"threads": n} for n in counts})
 
 
 FAMILIES = (termination, steps, asked, tiles, threads)
@@ -278,8 +282,8 @@ def bench_render(
     with use_threads(threads):
         machine = measure()
         rays = rays_of(field, scene)
-        bed = Bed(field, rays, truth_of(field, rays))
-        methods = {name: [_method(bed, way) for way in family(bed)] for name, family in families.items()}
+        case = RenderCase(field, rays, truth_of(field, rays))
+        methods = {name: [_method(case, variant) for variant in family(case)] for name, family in families.items()}
         rows = measured(methods, repeats, progress, torch.get_num_threads())
     for row in rows:
         row["rays_per_s"] = 1e9 / row["ns"]
@@ -290,7 +294,7 @@ def bench_render(
         "repeats": repeats,
         "rays": len(rays),
         "sampling": field.sampling._asdict(),
-        "reference": fine(field.sampling)._asdict() | {"samples": bed.truth.samples, "doubt": bed.truth.doubt},
+        "reference": fine(field.sampling)._asdict() | {"samples": case.truth.samples, "truth_error": case.truth.error},
     }
     figure = scatter_panels(rows, ("rays_per_s", "rays/s"), ("error", "error of radiance [full scale]"), "{problem}: {method}")
     columns = (
@@ -306,12 +310,12 @@ def bench_render(
     )
     note = (
         f" {len(rays):,} rays, the median of {repeats} turns; CPU ns: of all threads. Error and worst: of radiance, of full scale, against "
-        f"{bed.truth.samples:.0f} samples a ray, which is {bed.truth.doubt:.3%} from half as many. Depth: median, relative. Missed: rays "
+        f"{case.truth.samples:.0f} samples a ray, which is {case.truth.error:.3%} from half as many. Depth: median, relative. Missed: rays "
         "of which one met the surface and one did not."
     )
     return write_report(results, family_tables(rows, FAMILIES, columns, note), figure, out)
 
 
-def _method(bed: Bed, way: Way) -> Method:
-    run, judged = functools.partial(render, bed, way), functools.partial(judge, bed, way)
-    return Method(way.problem, way.name, run, judged, len(bed.rays), "full scale")
+def _method(case: RenderCase, variant: Variant) -> Method:
+    run, judged = functools.partial(render, case, variant), functools.partial(judge, case, variant)
+    return Method(variant.problem, variant.name, run, judged, len(case.rays), "full scale")

@@ -88,7 +88,7 @@ def test_error_falls_with_finer_sampling(results: dict[str, Any], problem: str) 
     ends = _of(results, "termination", "max_optical_depth", problem)
     assert [row["samples"] for row in ends] == sorted(row["samples"] for row in ends)
     assert ends[0]["error"] > 2 * ends[2]["error"]
-    assert 0 < results["reference"]["doubt"] < 0.5 * steps[0]["error"]
+    assert 0 < results["reference"]["truth_error"] < 0.5 * steps[0]["error"]
 
 
 def test_tiles_and_threads_change_nothing(results: dict[str, Any]) -> None:
