@@ -15,6 +15,9 @@ What a command does is one call:
 A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. A ``Recipe`` holds every number of a fit. Bad input raises
 ``InputError``, a fit that diverged ``DivergedError``, with one sentence each. Names are loaded when first used, so that ``mmsynth --help``
 does not wait for torch.
+
+The command line sets ``GOMP_SPINCOUNT=1000`` before torch is loaded, so that its threads do not spin beside another busy process; a script
+that shares its machine may want the same.
 """
 
 from __future__ import annotations
