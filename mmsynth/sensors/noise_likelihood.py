@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import log_ndtr
+from scipy.special import expit, log_ndtr
 
 QUANTISATION = 1.0 / 12.0
 
@@ -104,19 +104,22 @@ def outlier_variance(p: Parameters, d: Values, before: OutlierVariance) -> Outli
     return OutlierVariance(1.0, float(np.average((d.value**2 - variance)[whole], weights=likely[whole])))
 
 
-def _log_likelihood(p: Parameters, d: Values, factor: int, wide: OutlierVariance) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) and its gradient (N, 5)."""
+def _log_likelihood(p: Parameters, d: Values, factor: int, wide: OutlierVariance) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(N,), its derivative by the variance (N,) and by the logit of outliers (N,), and the variance's derivatives by the others (4, N)."""
     constant, gain, square, share = np.exp([p.constant, p.slope, p.square, p.variation])
-    terms = np.stack([np.full_like(d.mean, factor * constant), factor * gain * d.mean, factor * square * d.mean**2, share * d.activity], 1)
-    variance = terms.sum(1) + factor * QUANTISATION
+    terms = np.empty((4, len(d.mean)))
+    terms[0] = factor * constant
+    for row, scale, what in ((1, factor * gain, d.mean), (2, factor * square, d.mean**2), (3, share, d.activity)):
+        np.multiply(what, scale, out=terms[row])
+    variance = terms.sum(0) + factor * QUANTISATION
     unexpected = p.outlier_probability
-    log_narrow, narrow_slope = _log_density(d, variance)
-    log_wide, wide_slope = _log_density(d, wide.times * variance + wide.plus)
-    explained, not_explained = np.log1p(-unexpected) + log_narrow, np.log(unexpected) + log_wide
-    both = np.logaddexp(explained, not_explained)
-    of_wide = np.exp(not_explained - both)
-    by_variance = (1.0 - of_wide) * narrow_slope + of_wide * wide.times * wide_slope
-    return both, np.concatenate([by_variance[:, None] * terms, (of_wide - unexpected)[:, None]], 1)
+    narrow, narrow_slope = _log_density(d, variance)
+    broad, broad_slope = _log_density(d, wide.times * variance + wide.plus)
+    odds = broad - narrow + (np.log(unexpected) - np.log1p(-unexpected))  # logarithm, of an outlier
+    likelihood = narrow + np.log1p(-unexpected) + np.logaddexp(0.0, odds)
+    of_broad = expit(odds)
+    by_variance = narrow_slope + of_broad * (wide.times * broad_slope - narrow_slope)
+    return likelihood, by_variance, of_broad - unexpected, terms
 
 
 def _log_density(d: Values, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,8 +139,8 @@ def most_likely(start: Parameters, d: Values, factor: int, free: Sequence[Name],
     with_free = lambda x: replace(start, **dict(zip(free, x, strict=True)))
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _log_likelihood(with_free(x), d, factor, wide)
-        return -float(value.mean()), -gradient.mean(0)[chosen]
+        value, by_variance, by_outliers, terms = _log_likelihood(with_free(x), d, factor, wide)
+        return -float(value.mean()), -np.append(terms @ by_variance, by_outliers.sum())[chosen] / len(value)
 
     first, low, high = (np.array(astuple(p))[chosen] for p in (start, _LOW, _HIGH))
     options = {"ftol": 1e-12, "gtol": 1e-8}
@@ -149,8 +152,9 @@ def most_likely(start: Parameters, d: Values, factor: int, free: Sequence[Name],
 def estimate_of(p: Parameters, d: Values, factor: int, free: Sequence[Name], wide: OutlierVariance = TEXTURE) -> Estimate:
     """The most likely parameters with their covariance (sandwich estimator), regions of a frame taken as independent."""
     chosen = [_NAMES.index(name) for name in free]
-    scores = _log_likelihood(p, d, factor, wide)[1][:, chosen]
-    _, index = np.unique(np.stack([d.region, d.frame]), axis=1, return_inverse=True)
+    _, by_variance, by_outliers, terms = _log_likelihood(p, d, factor, wide)
+    scores = np.concatenate([terms * by_variance, by_outliers[None]])[chosen].T
+    _, index = np.unique(d.region * (d.frame.max() + 1) + d.frame, return_inverse=True)
     per_block = np.stack([np.bincount(index, weights=s) for s in scores.T], 1)
     inverse = np.linalg.pinv(scores.T @ scores)
     covariance = np.zeros((5, 5))
