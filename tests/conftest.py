@@ -1,20 +1,29 @@
-"""Small scenes written to disk, in the formats that the readers know."""
+"""Small scenes written to disk, in the formats that the readers know; one thread for each of the processes that share the tests."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
+import torch
 
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 
 WIDTH, HEIGHT = 24, 18
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # two threads a process on two cores wait for each other at every barrier; a test may still ask for more
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # of commands that tests start
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

@@ -13,6 +13,9 @@ from mmsynth.scene.images import saturation_level
 from mmsynth.scene.scene import Sensor, canonical_modality
 from mmsynth.sensors.mosaic import pattern_of
 
+DESCRIBED_BY = ("mosaick_pattern", "channels", "wavelengths_nm", "polarizer_angles_deg")
+"""Keys of a file by which ``make_sensor`` knows a sensor."""
+
 _MS_NM = (692.0, 653.0, 611.0, 572.0, 541.0, 503.0, 464.0, 431.0, None)
 
 # labels, wavelengths (None: broad), polarizer angles and raw pattern of the modalities of MMS-DATA
