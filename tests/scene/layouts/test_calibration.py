@@ -50,14 +50,15 @@ def test_written_rigs_are_read_back(tmp_path_factory: pytest.TempPathFactory, se
 
 def test_the_example_of_the_format_is_read(tmp_path: Path) -> None:
     """Six coefficients in OpenCV's order, as MMS-DATA's source scenes have them; the reference is the first key."""
+    lens = [-0.1, 0.08, 3e-4, -2e-4, 0.01, 0.002]
     entry = {
         **REFERENCE,
         "sensor": "Basler",
-        "distortion_params": [-0.1, 0.08, 3e-4, -2e-4, 0.01, 0.002],
+        "distortion_params": lens,
         "mosaick_pattern": [[1, 2], [0, 1]],
     }
     sensor = read_calibration(_write(tmp_path / "calibration.json", {"rgb": entry}))["rgb"]
-    assert sensor.camera.coefficients.tolist() == [-0.1, 0.08, 3e-4, -2e-4, 0.01, 0.002, 0.0, 0.0]
+    assert sensor.camera.coefficients.tolist() == [*lens, 0.0, 0.0]
     assert sensor.described == {"mosaick_pattern": [[1, 2], [0, 1]]}
 
 
