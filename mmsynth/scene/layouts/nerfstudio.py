@@ -26,6 +26,7 @@ from mmsynth.scene.capture.boards import board_points
 from mmsynth.scene.checks import is_file, make_camera, number, numbers, objects, rigid_pose, whole
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.points import read_ply_points
 from mmsynth.scene.region import region_from_cameras, region_from_points
 from mmsynth.scene.scene import (
     MAX_VIEW,
@@ -139,25 +140,13 @@ def _region(meta: Mapping[str, Any], root: Path, sensors: Mapping[str, Sensor], 
     region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
     stands = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
     if "ply_file_path" in meta:
-        points = _sparse_points(root / str(meta["ply_file_path"]))
+        points = read_ply_points(root / str(meta["ply_file_path"]))
         if points is not None:
-            return region_from_points(points, region, stands)
+            return region_from_points(points.positions, region, stands)
         problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
         return region
     plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
     return region_from_points(board_points(plain), region, stands) if plain else region
-
-
-def _sparse_points(path: Path) -> np.ndarray | None:
-    """(N, 3) finite points of a PLY file; None where there are none."""
-    import trimesh  # takes its time
-
-    try:
-        points = np.asarray(getattr(trimesh.load(path), "vertices", ()), dtype=np.float64)
-    except Exception:  # a file of any kind may stand there, and each of trimesh's readers has its own exceptions
-        return None
-    points = points[np.isfinite(points).all(1)] if points.ndim == 2 and points.shape[1] == 3 else points[:0]
-    return points if len(points) else None
 
 
 def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None:
