@@ -21,6 +21,8 @@ from mmsynth.errors import InputError
 from mmsynth.sensors.camera import Camera
 
 Layout = Literal["MMS-DATA", "nerfstudio", "Middlebury"]
+MaskMeaning = Literal["object", "ignore", "off"]
+"""What masks say of the pixels outside: nothing is there (opacity 0, and 1 inside); not to be learned from; nothing, they only score."""
 
 MAX_VIEW = 999_999_999  # ids of views are whole numbers from 0
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -166,6 +168,7 @@ class Scene:
         unit: "m" where the input says so, else "input unit".
         black_background: True when the input says that what is outside the object is black or transparent,
             None when it does not say.
+        masks: what the frames' masks mean.
         problems: one sentence each, to be shown by ``mmsynth info`` (missing images, dropped frames, ...).
     """
 
@@ -177,6 +180,7 @@ class Scene:
     split: Split
     unit: str = "input unit"
     black_background: bool | None = None
+    masks: MaskMeaning = "off"
     problems: tuple[str, ...] = ()
 
     def frames_of(self, sensor: str, views: tuple[int, ...] | None = None) -> tuple[Frame, ...]:

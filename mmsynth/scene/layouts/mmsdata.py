@@ -85,7 +85,7 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
     if radius <= 0:
         raise InputError(f"{path}: key 'scene_box': radius {radius}, expected a positive number.")
     region = ball(to_output[:3, 3], scale * radius)
-    return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, None, tuple(problems))
+    return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, problems=tuple(problems))
 
 
 def read_reference_poses(path: Path) -> list[StatedPose]:
