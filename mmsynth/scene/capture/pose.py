@@ -16,9 +16,10 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_json
+from mmsynth.scene.capture.matching import Picture, Shot, focal_length_of, load_pycolmap
 from mmsynth.scene.capture.matching_picture import matching_picture
 from mmsynth.scene.capture.source import Capture, check_size, pictures_of
-from mmsynth.scene.capture.structure import Picture, Shot, Structure, focal_length_of, load_pycolmap, reconstruct
+from mmsynth.scene.capture.structure import Structure, reconstruct
 from mmsynth.scene.image_writers import write_png
 from mmsynth.scene.images import read_native
 from mmsynth.scene.layouts.mmsdata import meta_content
