@@ -16,13 +16,14 @@ from mmsynth.files import read_json
 from mmsynth.scene.also import stated_source, with_sensors
 from mmsynth.scene.checks import rigid_pose
 from mmsynth.scene.layouts.blender import SPLITS, file_of, read_blender
-from mmsynth.scene.layouts.colmap import models_in, read_colmap
+from mmsynth.scene.layouts.colmap import models_in, read_colmap, read_colmap_points
 from mmsynth.scene.layouts.colmap_model import read_model_poses
 from mmsynth.scene.layouts.middlebury import read_middlebury
-from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_reference_poses
-from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_transforms
+from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_mmsdata_points, read_reference_poses
+from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_nerfstudio_points, read_transforms
 from mmsynth.scene.layouts.neus import cameras_of, read_neus
 from mmsynth.scene.layouts.tum import is_tum, read_tum
+from mmsynth.scene.points import SparsePoints
 from mmsynth.scene.scene import Frame, Layout, Region, Scene, SceneSource, StatedPose
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 
@@ -202,6 +203,15 @@ def _read_matrices(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
     if not isinstance(content["rig"], list):
         raise InputError(f"{path}: key 'rig' is not a list of 4x4 matrices.")
     return [StatedPose(None, rigid_pose(matrix, f"{path}: pose {index}"), f"{index:04d}") for index, matrix in enumerate(content["rig"])]
+
+
+def sparse_points(scene: Scene) -> SparsePoints | None:
+    """The sparse points that lie with a scene, in its frame and unit; None where there are none."""
+    if scene.format == "COLMAP":
+        return read_colmap_points(scene.root, scene.source.images if scene.source else None)
+    readers: dict[str, Callable[[Path], SparsePoints | None]] = {"MMS-DATA": read_mmsdata_points, "nerfstudio": read_nerfstudio_points}
+    read = readers.get(scene.format)
+    return None if read is None else read(scene.root)
 
 
 def sees(frame: Frame, region: Region) -> bool:

@@ -53,6 +53,11 @@ def open_run(folder: Path | None = None, *, device: str = "cpu") -> Run:
     return Run(folder, field, load_again(field.manifest["scene"], modalities=list(field.sensors)))
 
 
+def is_run(folder: Path) -> bool:
+    """Whether a fit wrote this folder."""
+    return (folder / "field.safetensors").is_file()
+
+
 def new_run(scene_name: str) -> Path:
     """A run folder that does not exist yet; nothing is created."""
     count = 1

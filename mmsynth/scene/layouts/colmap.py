@@ -23,6 +23,7 @@ from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.layouts.colmap_model import ModelImage, is_model, read_model, read_points
 from mmsynth.scene.layouts.pictures import Pictures, Resizes
+from mmsynth.scene.points import SparsePoints
 from mmsynth.scene.region import region_from_cameras, region_from_points
 from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality, make_split
 from mmsynth.sensors.camera import Camera
@@ -60,10 +61,16 @@ def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Pat
         frames += sorted(placed, key=lambda frame: frame.view)
     poses = [frame.camera_to_world for frame in frames]
     seen = region_from_cameras([frame.camera for frame in frames], poses)
-    region = region_from_points(read_points(taken.folder), seen, np.stack([pose[:3, 3] for pose in poses]))
+    points = read_points(taken.folder)
+    region = seen if points is None else region_from_points(points.positions, seen, np.stack([pose[:3, 3] for pose in poses]))
     split = make_split(frame.view for frame in frames)
     alpha = any(image.ndim == 3 and image.shape[2] in (2, 4) for image in first.values())
     return Scene(root, "COLMAP", sensors, tuple(frames), region, split, black_background=True if alpha else None, problems=tuple(problems))
+
+
+def read_colmap_points(root: Path, images: Path | None = None) -> SparsePoints | None:
+    """The sparse points of the model that ``read_colmap`` takes."""
+    return read_points(_best_model(root, images)[0].folder)
 
 
 # --- the model that belongs to the pictures

@@ -17,6 +17,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.scene.checks import floats, make_camera, rotation_of, text_lines
+from mmsynth.scene.points import SparsePoints
 from mmsynth.scene.scene import StatedPose
 from mmsynth.sensors.camera import COEFFICIENTS, MAX_SIZE, Camera, Lens
 
@@ -83,12 +84,15 @@ def read_model_poses(path: Path) -> list[StatedPose]:
     return [StatedPose(_camera_of(one, cameras, path), one.camera_to_world, PurePosixPath(one.name).stem) for one in listed]
 
 
-def read_points(folder: Path) -> np.ndarray:
-    """(N, 3) float64 points of a model that three images or more see, (0, 3) where it has none."""
+def read_points(folder: Path) -> SparsePoints | None:
+    """The points of a model that three images or more see; None where it has none."""
     binary, text = folder / "points3D.bin", folder / "points3D.txt"
-    found = _points_bin(binary) if binary.is_file() else _points_txt(text) if text.is_file() else iter(())
-    points = np.array([xyz for xyz, seen in found if seen >= 3], dtype=np.float64).reshape(-1, 3)
-    return points[np.isfinite(points).all(1)]
+    listed = _points_bin(binary) if binary.is_file() else _points_txt(text) if text.is_file() else iter(())
+    found = [(xyz, rgb) for xyz, rgb, seen in listed if seen >= 3 and np.isfinite(xyz).all()]
+    if not found:
+        return None
+    positions, colours = (np.array(part) for part in zip(*found, strict=True))
+    return SparsePoints(positions.astype(np.float64), np.clip(colours, 0, 255).astype(np.uint8))
 
 
 # --- what both have in common
@@ -207,13 +211,14 @@ def _cameras_txt(path: Path) -> Iterator[tuple[int, Camera]]:
         yield identity, _camera(tokens[1], (width, height), parameters.tolist(), where)
 
 
-def _points_txt(path: Path) -> Iterator[tuple[Sequence[float], int]]:
+def _points_txt(path: Path) -> Iterator[tuple[Sequence[float], Sequence[float], int]]:
     line = "id x y z r g b error track"
     for where, tokens in text_lines(path):
         if tokens:
             if len(tokens) < 8:
                 raise InputError(f"{where}: {len(tokens)} values, expected '{line}'.")
-            yield floats(tokens[1:4], where, line).tolist(), (len(tokens) - 8) // 2
+            values = floats(tokens[1:7], where, line).tolist()
+            yield values[:3], values[3:], (len(tokens) - 8) // 2
 
 
 def _frames_txt(path: Path) -> Iterator[tuple[int, list[int]]]:
@@ -301,13 +306,13 @@ def _images_bin(path: Path) -> list[_Listed]:
     return out
 
 
-def _points_bin(path: Path) -> Iterator[tuple[Sequence[float], int]]:
+def _points_bin(path: Path) -> Iterator[tuple[Sequence[float], Sequence[float], int]]:
     file = _Bytes(path)
     (count,) = file.take("Q")
     for _ in range(count):
-        _, x, y, z, _, _, _, _, seen = file.take("Q3d3BdQ")
+        _, *values, _, seen = file.take("Q3d3BdQ")
         file.skip(8 * seen)
-        yield (x, y, z), seen
+        yield values[:3], values[3:], seen
 
 
 def _frames_bin(path: Path) -> Iterator[tuple[int, list[int]]]:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from mmsynth.errors import InputError
 from mmsynth.scene.layouts import colmap_model
 from mmsynth.scene.layouts.colmap_model import read_model, read_points
-from mmsynth.scene.load import load_scene, read_poses
+from mmsynth.scene.load import load_scene, read_poses, sparse_points
 from mmsynth.sensors.camera import project
 
 SIZE = (24, 18)
@@ -116,7 +116,10 @@ def test_pixels_are_those_of_pycolmap(tmp_path: Path, lens: str, text: bool) -> 
         expected = [theirs.project_point(point) for point in points[near]]
         assert image.camera is not None and near.sum() > 10
         np.testing.assert_allclose(project(local[near], image.camera) + 0.5, expected, atol=1e-8)
-    np.testing.assert_allclose(np.sort(read_points(tmp_path / "sparse" / "0"), 0), np.sort(points, 0), atol=1e-12)
+    cloud = read_points(tmp_path / "sparse" / "0")
+    assert cloud is not None
+    np.testing.assert_allclose(np.sort(cloud.positions, 0), np.sort(points, 0), atol=1e-12)
+    np.testing.assert_array_equal(np.sort(cloud.colours, 0), np.sort([point.color for point in made.points3D.values()], 0))
 
 
 @pytest.mark.parametrize("lens", OTHERS)
@@ -265,7 +268,9 @@ def test_subfolders_of_one_camera_or_of_two_walks_are_no_rig(tmp_path: Path) -> 
 
 def test_sparse_points_give_the_region(tmp_path: Path) -> None:
     scene_folder(tmp_path, points=400)
-    region = load_scene(tmp_path).region
+    scene = load_scene(tmp_path)
+    region, points = scene.region, sparse_points(scene)
+    assert points is not None and points.positions.shape == points.colours.shape == (400, 3)
     assert np.linalg.norm(region.centre) < 0.05 and 0.2 < region.radius < 0.5
 
 
