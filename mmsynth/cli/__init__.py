@@ -1,6 +1,7 @@
 """The command line: each command parses, calls one public function, and prints.
 
-``fields``, ``products``, ``capture`` and ``bench`` have the commands, ``arguments`` their options, ``terminal`` what all of them print with.
+``capture``, ``fields``, ``products`` and ``bench`` have the commands, ``arguments`` their options, ``terminal`` what all of them print
+with.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Commands for captures that are no scene yet: calibrate."""
+"""Commands that lead from pictures on disk to a scene: calibrate, pose."""
 
 from __future__ import annotations
 
@@ -45,3 +45,20 @@ def calibrate(
     for problem in result.problems:
         print(problem)
     print(f"wrote {out}, {out.stem}_report.json and report.html")
+
+
+@command("pose")
+def pose(
+    capture: Annotated[Path, typer.Argument(help="a folder of photographs, one folder for each sensor, or a source scene of MMS-DATA")],
+    calibration: Annotated[Path | None, typer.Option(help="calibration.json of the rig; default: the capture's own")] = None,
+    reference: Annotated[str | None, typer.Option(help="sensor that the others stand by; default: the calibration's first, or rgb")] = None,
+    out: Annotated[Path | None, typer.Option(help="the scene's folder; default: NAME_scene")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find where pictures were taken, and make a scene of them."""
+    from mmsynth.report.pose import pose_text
+    from mmsynth.workflows.pose import pose_scene
+
+    with progress_bar("pose", as_json) as show:
+        facts = pose_scene(capture, out, calibration=calibration, reference=reference, progress=show)
+    print(json.dumps(facts) if as_json else pose_text(facts))

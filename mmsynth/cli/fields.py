@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from mmsynth.cli.arguments import (
+    AlsoOption,
     DeviceOption,
     FramesOption,
+    ImagesOption,
     JsonOption,
+    LayoutOption,
     ModalitiesOption,
     RecipeOption,
     RunOption,
@@ -21,6 +24,7 @@ from mmsynth.cli.arguments import (
     modality_names,
     modality_pairs,
     scene_path,
+    sensor_folders,
 )
 from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
@@ -31,12 +35,18 @@ if TYPE_CHECKING:
 
 
 @command("info")
-def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
+def info(
+    scene: SceneArgument,
+    layout: LayoutOption = None,
+    images: ImagesOption = None,
+    also: AlsoOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
     from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
 
-    description = describe_scene(load_scene(scene_path(scene)))
+    description = describe_scene(load_scene(scene_path(scene), layout=layout, images=images, also=sensor_folders(also)))
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -47,6 +57,9 @@ def fit(
     recipe: RecipeOption = None,
     modalities: ModalitiesOption = None,
     frames: FramesOption = None,
+    layout: LayoutOption = None,
+    images: ImagesOption = None,
+    also: AlsoOption = None,
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
@@ -65,7 +78,8 @@ def fit(
     from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    loaded = keep_frames(load_scene(scene_path(scene), modalities=modality_names(modalities)), frame_limits(frames))
+    read = load_scene(scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also))
+    loaded = keep_frames(read, frame_limits(frames))
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")

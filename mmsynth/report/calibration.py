@@ -74,7 +74,8 @@ def _sensors(calibration: Calibration) -> _Table:
     ]
     rows = [
         [
-            name, s.model, f"{s.boards} in {s.frames} frames", str(s.corners), f"{100 * s.coverage:.0f} %", f"{s.rms:.3f}", f"{s.sigma:.3f}",
+            name, s.model, f"{s.boards} in {s.frames} frames",
+             str(s.corners), f"{100 * s.coverage:.0f} %", f"{s.rms:.3f}", f"{s.sigma:.3f}",
             ", ".join(f"{model} {error:.3f}" for model, error in s.held_out.items()),
         ]
         for name, s in calibration.sensors.items()
@@ -212,7 +213,9 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
             }
             for name, s in calibration.sensors.items()
         },
-        "sightings": [{"sensor": s.sensor, "instant": s.instant, "board": s.board, "corners": len(s.ids), "rms": s.rms} for s in calibration.seen],
+        "sightings": [
+            {"sensor": s.sensor, "instant": s.instant, "board": s.board, "corners": len(s.ids), "rms": s.rms} for s in calibration.seen
+        ],
         "left_out": [{"sensor": o.sensor, "instant": o.instant, "board": o.board, "why": o.why} for o in calibration.left_out],
         "problems": list(calibration.problems),
     }  # fmt: skip

@@ -13,7 +13,7 @@ from typing import Any
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
-from mmsynth.scene.load import load_scene
+from mmsynth.scene.load import load_again
 from mmsynth.scene.scene import Scene
 
 _RUNS = Path("runs")
@@ -50,7 +50,12 @@ def open_run(folder: Path | None = None, *, device: str = "cpu") -> Run:
         InputError: as ``open_field``, or the scene cannot be read.
     """
     folder, field = open_field(folder, device=device)
-    return Run(folder, field, load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors)))
+    return Run(folder, field, load_again(field.manifest["scene"], modalities=list(field.sensors)))
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a fit wrote this folder."""
+    return (folder / "field.safetensors").is_file()
 
 
 def new_run(scene_name: str) -> Path:

@@ -252,7 +252,7 @@ class _System:
         np.add.at(self.boards_right, pose, (board @ error[:, :, None])[..., 0])
 
     def step(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        boards = self.boards + damping * np.einsum("pii->pi", self.boards)[:, :, None] * np.eye(6) + 1e-12 * np.eye(6)
+        boards = self.boards + damping * np.einsum("pii->pi", self.boards)[:, :, None] * np.eye(6) + self._ridge()
         scale = 1 / np.sqrt(np.maximum(np.diag(self.sensors), 1e-30))
         inner = np.linalg.solve(boards, self.between.transpose(0, 2, 1))  # (P, 6, C)
         inner_right = np.linalg.solve(boards, self.boards_right[..., None])[..., 0]
@@ -262,8 +262,12 @@ class _System:
         sensors = scale * np.linalg.lstsq(scaled, scale * right, rcond=1e-15)[0]
         return sensors, inner_right - np.einsum("pbc,c->pb", inner, sensors)
 
+    def _ridge(self) -> np.ndarray:
+        """What keeps a board whose corners lie on one line from having no inverse."""
+        return (1e-12 * np.einsum("pii->p", self.boards) + 1e-12)[:, None, None] * np.eye(6)
+
     def covariance(self) -> np.ndarray:
-        inner = np.linalg.solve(self.boards + 1e-12 * np.eye(6), self.between.transpose(0, 2, 1))
+        inner = np.linalg.solve(self.boards + self._ridge(), self.between.transpose(0, 2, 1))
         reduced = self.sensors - np.einsum("pcb,pbd->cd", self.between, inner, optimize=True)
         scale = 1 / np.sqrt(np.maximum(np.diag(self.sensors), 1e-30))
         values, vectors = np.linalg.eigh(reduced * np.outer(scale, scale))

@@ -115,7 +115,7 @@ def check_joined(
         )
     if unclear:
         raise InputError(
-            f"{where}: the place of '{unclear[0]}' on the rig is open: its boards look the same when turned, and all of them leave the same "
+            f"{where}: the place of '{unclear[0]}' on the rig is open: its boards look the same when turned, and all leave the same "
             f"choice; expected more instants with the board elsewhere, or a board with an odd and an even side."
         )
 
@@ -186,9 +186,7 @@ def problems_of(name: str, sensor: SensorFrames, camera: Camera, result: Any, se
         out.append(f"{name}: the focal length is known to {100 * share:.1f} % only; more boards at 20 to 50 degrees of tilt would help.")
     without = sum(not several for several in sensor.found.values())
     if 2 * without > len(sensor.files):
-        out.append(
-            f"{name}: no board is seen in {without} of {len(sensor.files)} frames; its spectral band may not tell the board's ink from its paper."
-        )
+        out.append(f"{name}: no board is seen in {without} of {len(sensor.files)} frames; its band may not tell ink from paper.")
     if result.blind:
         places = ", ".join(f"row {i} column {j}" for i, j in result.blind)
         out.append(f"{name}: the photosites at {places} of the mosaic's tile hardly see the boards and are not used for corners.")
@@ -197,13 +195,11 @@ def problems_of(name: str, sensor: SensorFrames, camera: Camera, result: Any, se
     share = pattern_of(camera, seen)
     if share > _PATTERN:
         out.append(
-            f"{name}: the residuals follow a pattern over the picture ({100 * share:.0f} % of them): the lens is none of the models that were "
+            f"{name}: the residuals follow a pattern over the picture ({100 * share:.0f} % of them): the lens is none of those that were "
             f"tried, or the boards are not flat."
         )
     if "mosaick_pattern" not in sensor.described and sensor.tile != (1, 1):
-        out.append(
-            f"{name}: frames are a mosaic of {sensor.tile[0]}x{sensor.tile[1]} whose channels are not known; add mosaick_pattern to the result."
-        )
+        out.append(f"{name}: frames are a {sensor.tile[0]}x{sensor.tile[1]} mosaic of unknown channels; add mosaick_pattern to the result.")
     return out
 
 
