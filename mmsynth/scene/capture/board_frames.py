@@ -11,7 +11,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ class SensorFrames:
         pattern: of the mosaic; None: there is none, or (``tile``) its channels are not known.
         tile: rows and columns after which the mosaic repeats.
         described: keys that describe it in ``calibration.json``.
-        found: boards by instant. same: instants whose file is that of an earlier one.
+        found: boards by instant. digests: of the frames' pixels, by instant.
     """
 
     name: str
@@ -48,7 +48,15 @@ class SensorFrames:
     tile: tuple[int, int]
     described: Mapping[str, Any]
     found: Mapping[str, Sequence[Detection]] = field(default_factory=dict)
-    same: Mapping[str, str] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def same(self) -> dict[str, str]:
+        """Instants whose picture is that of an earlier one: that one."""
+        first: dict[str, str] = {}
+        for instant, digest in self.digests.items():
+            first.setdefault(digest, instant)
+        return {instant: first[digest] for instant, digest in self.digests.items() if first[digest] != instant}
 
 
 def list_frames(folder: Path) -> dict[str, SensorFrames]:
@@ -124,8 +132,7 @@ def find_in_frames(
     Raises:
         InputError: a frame cannot be read, or has another size than the first.
     """
-    seen: dict[str, str] = {}
-    same: dict[str, str] = {}
+    digests: dict[str, str] = {}
 
     def look(item: tuple[str, Path]) -> tuple[str, str, list[Detection]]:
         instant, path = item
@@ -141,10 +148,8 @@ def find_in_frames(
     with ThreadPoolExecutor(workers) as pool:
         for instant, digest, detections in pool.map(look, sensor.files.items()):
             found[instant] = detections
-            if digest in seen:
-                same[instant] = seen[digest]
-            seen.setdefault(digest, instant)
+            digests[instant] = digest
             done += 1
             if progress is not None:
                 progress(done, total)
-    return SensorFrames(sensor.name, sensor.source_name, sensor.files, sensor.size, sensor.tile, sensor.described, found, same)
+    return replace(sensor, found=found, digests=digests)

@@ -28,15 +28,14 @@ _BARE = 0.35  # share of the picture's fields below which its corners are empty
 
 def check_same_files(sensors: Mapping[str, SensorFrames], where: str) -> None:
     """Raises InputError: two sensors have the same pictures."""
-    folders: dict[tuple[str, ...], str] = {}
+    seen: dict[str, tuple[str, str]] = {}
     for name, sensor in sensors.items():
-        some = list(sensor.files.values())[:2]
-        digest = tuple(str(hash(read_image(path).tobytes())) for path in some)
-        if digest in folders:
-            raise InputError(
-                f"{where}: '{name}' and '{folders[digest]}' hold the same pictures ({some[0].name}), expected frames of two sensors."
-            )
-        folders[digest] = name
+        for instant, digest in sensor.digests.items():
+            other, when = seen.setdefault(digest, (name, instant))
+            if other != name:
+                raise InputError(
+                    f"{where}: frame {instant} of '{name}' and frame {when} of '{other}' are the same picture, expected those of two."
+                )
 
 
 def why_no_board(sensor: SensorFrames, boards: Sequence[Board]) -> str | None:

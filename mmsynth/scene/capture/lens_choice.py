@@ -14,8 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mmsynth.scene.capture.adjustment import Adjusted, RigState, View, adjust, inverse
-from mmsynth.sensors.camera import Camera, Lens, project, unproject
+from mmsynth.scene.capture.adjustment import Adjusted, RigState, View, adjust
+from mmsynth.scene.capture.derivatives import project_with_derivatives
+from mmsynth.sensors.camera import Camera, Lens, unproject
 
 MODELS: dict[str, tuple[Lens, tuple[int, ...]]] = {
     "pinhole": ("brown_conrady", ()),
@@ -30,6 +31,7 @@ _FOCAL = np.geomspace(0.25, 6.0, 28)  # of the longer side: fields of view from 
 _FOLDS = 3
 _OUTLIER = 4.0  # standard deviations at which the error of a held-out corner stops to count
 _WORTH = 0.005  # of the squared error that more coefficients must take away
+_AHEAD = 0.1  # cosine of the angle off axis up to which rays lead forward
 _TRIALS = 12  # boards that a focal length is tried on
 
 
@@ -86,20 +88,19 @@ def calibrate_alone(size: tuple[int, int], views: Sequence[View]) -> Alone | Non
 
 def board_pose(camera: Camera, view: View) -> np.ndarray | None:
     """(4, 4) points of the board → of the camera; None where there is none in front of it."""
-    rays, valid = unproject(view.pixels, camera)
-    ahead = valid & (rays[:, 2] > 0.1)
+    flat = _ideal(camera, view.pixels)
+    ahead = np.isfinite(flat).all(1)
     if ahead.sum() < 4:
         return None
-    flat = rays[ahead, :2] / rays[ahead, 2:]
+    flat = flat[ahead]
     done, turns, shifts, _ = _ippe(view.points[ahead], flat)
     best, least = None, np.inf
     for k in range(done):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turns[k])[0], np.ravel(shifts[k])
-        error = view.pixels - project(view.points @ pose[:3, :3].T + pose[:3, 3], camera)
-        size = np.median(np.where(np.isfinite(error).all(1), (error**2).sum(1), 1e12))
+        size = float(np.median(np.minimum(errors_of(camera, view, pose), 1e9)))
         if size < least:
-            best, least = pose, float(size)
+            best, least = pose, size
     return best
 
 
@@ -110,9 +111,23 @@ def _ippe(points: np.ndarray, flat: np.ndarray) -> Any:
         return 0, (), (), None
 
 
+def _ideal(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """(N, 2) x / z and y / z of the pixels' rays, NaN where they do not lead forward."""
+    if any(camera.distortion):
+        rays, valid = unproject(pixels, camera)
+        ahead = valid & (rays[:, 2] > _AHEAD)
+        return np.where(ahead[:, None], rays[:, :2] / np.where(ahead, rays[:, 2], 1.0)[:, None], np.nan)
+    image = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if camera.lens == "brown_conrady":
+        return image
+    angle = np.maximum(np.linalg.norm(image, axis=1, keepdims=True), 1e-12)
+    return np.where(np.cos(angle) > _AHEAD, image * np.tan(angle) / angle, np.nan)
+
+
 def errors_of(camera: Camera, view: View, pose: np.ndarray) -> np.ndarray:
     """(N,) px; infinite where a corner has no pixel."""
-    error = np.linalg.norm(view.pixels - project(view.points @ pose[:3, :3].T + pose[:3, 3], camera), axis=1)
+    seen = project_with_derivatives(view.points @ pose[:3, :3].T + pose[:3, 3], camera)[0]
+    error = np.linalg.norm(view.pixels - seen, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
 
@@ -152,15 +167,10 @@ def _held_out(adjusted: Adjusted, views: Sequence[View]) -> np.ndarray:
         camera = fitted.state.cameras[0]
         for view, keep in zip(views, kept, strict=True):
             pose = fitted.state.boards[view.pose]
-            seen = project(view.points[~keep] @ pose[:3, :3].T + pose[:3, 3], camera)
+            seen = project_with_derivatives(view.points[~keep] @ pose[:3, :3].T + pose[:3, 3], camera)[0]
             out.append(np.where(np.isfinite(seen), view.pixels[~keep] - seen, 1e3))
     return np.concatenate(out)
 
 
 def _part(view: View, keep: np.ndarray) -> View:
     return replace(view, points=view.points[keep], pixels=view.pixels[keep])
-
-
-def relative(to_a: np.ndarray, to_b: np.ndarray) -> np.ndarray:
-    """Points of camera a → of camera b, by a board's poses in both."""
-    return np.asarray(to_b @ inverse(to_a))
