@@ -75,6 +75,17 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
     }
 
 
+def what_scenes_add(scene: Scene) -> dict[str, Any]:
+    """What no layout for photographs holds: ``modalities`` (keys of ``known_sensors.make_sensor``), ``unit`` and ``region``."""
+    described = {
+        name: {key: value for key, value in channels_to_json(sensor).items() if value is not None}
+        | ({} if sensor.mosaic is None else {"mosaick_pattern": sensor.mosaic.tolist()})
+        for name, sensor in scene.sensors.items()
+    }
+    region = {"centre": list(scene.region.centre), "radius": scene.region.radius}
+    return {"modalities": described, "unit": scene.unit, "region": region}
+
+
 def sensor_from_json(stated: Mapping[str, Any]) -> Sensor:
     """What ``sensor_to_json`` wrote."""
     angles = stated["polarizer_angles_deg"]
