@@ -12,12 +12,14 @@ from mmsynth.cli.arguments import (
     DeviceOption,
     FramesOption,
     JsonOption,
+    MasksOption,
     ModalitiesOption,
     RecipeOption,
     RunOption,
     SceneArgument,
     fit_length,
     frame_limits,
+    masks_of,
     modality_names,
     modality_pairs,
     scene_path,
@@ -31,12 +33,13 @@ if TYPE_CHECKING:
 
 
 @command("info")
-def info(scene: SceneArgument, as_json: JsonOption = False) -> None:
+def info(scene: SceneArgument, masks: MasksOption = None, as_json: JsonOption = False) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
     from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
+    from mmsynth.scene.masks import use_masks
 
-    description = describe_scene(load_scene(scene_path(scene)))
+    description = describe_scene(use_masks(load_scene(scene_path(scene)), *masks_of(masks)))
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -47,6 +50,7 @@ def fit(
     recipe: RecipeOption = None,
     modalities: ModalitiesOption = None,
     frames: FramesOption = None,
+    masks: MasksOption = None,
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
@@ -61,11 +65,13 @@ def fit(
     from mmsynth.fitting.trainer import FitProgress
     from mmsynth.report.text import fit_text
     from mmsynth.scene.load import load_scene
+    from mmsynth.scene.masks import use_masks
     from mmsynth.scene.scene import keep_frames
     from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    loaded = keep_frames(load_scene(scene_path(scene), modalities=modality_names(modalities)), frame_limits(frames))
+    loaded = load_scene(scene_path(scene), modalities=modality_names(modalities))
+    loaded = use_masks(keep_frames(loaded, frame_limits(frames)), *masks_of(masks))
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")
@@ -93,6 +99,7 @@ def fit(
 @command("evaluate")
 def evaluate(
     run: RunOption = None,
+    masks: MasksOption = None,
     convert: Annotated[
         str | None, typer.Option(help="score conversions instead, e.g. rgb:ms or rgb:ms,mono:pol; all: every pair", metavar="FROM:TO")
     ] = None,
@@ -104,7 +111,8 @@ def evaluate(
     from mmsynth.workflows.fit import evaluate_run
     from mmsynth.workflows.runs import open_run
 
-    opened = open_run(run)
+    meaning, folder = masks_of(masks)
+    opened = open_run(run, masks=meaning, mask_folder=folder)
     with progress_bar("evaluate", as_json) as show:
         if convert is None:
             scores = evaluate_run(opened, progress=show)

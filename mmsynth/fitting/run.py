@@ -132,6 +132,8 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
             "format": scene.format,
             "hash": trainer.task["scene"],
             "test_views": list(scene.split.test),
+            "masks": scene.masks,
+            "mask_folder": None if scene.mask_folder is None else str(scene.mask_folder.resolve()),
         },
         "recipe": trainer.recipe.model_dump(),
         "needs": asdict(replace(trainer.needs, choices=trainer.choices)),

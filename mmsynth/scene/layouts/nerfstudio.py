@@ -82,8 +82,10 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
     alpha = any(first[source].ndim == 3 and first[source].shape[2] > count for source, count in plain.items())
     region = _region(meta, root, sensors, frames, problems)
     split = _split(meta, frames, path)
-    transparent = True if alpha else None
-    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, "input unit", transparent, "ignore", tuple(problems))
+    black = True if alpha else None
+    return Scene(
+        root, "nerfstudio", sensors, tuple(frames), region, split, black_background=black, masks="ignore", problems=tuple(problems)
+    )
 
 
 def _source(frame: Mapping[str, Any]) -> str:
