@@ -10,6 +10,7 @@ What a command does is one call:
 * ``mmsynth simulate``: ``simulate``. ``SensorTwin``: the effects of one sensor on tensors.
 * ``mmsynth calibrate-noise``: ``calibrate_noise``.
 * ``mmsynth mesh``: ``mesh_to_file``. ``extract_mesh`` and ``write_mesh``: in memory, then to a file.
+* ``mmsynth export``: ``export_scene``.
 * ``mmsynth batch``: ``run_batch``.
 
 A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. A ``Recipe`` holds every number of a fit. Bad input raises
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from mmsynth.operations.dataset.index import verify_dataset
     from mmsynth.operations.evaluation.conversions import evaluate_conversions
     from mmsynth.operations.evaluation.evaluate import evaluate
+    from mmsynth.operations.export.export import export_scene
     from mmsynth.operations.mesh.extract import extract_mesh, mesh_to_file
     from mmsynth.operations.mesh.files import write_mesh
     from mmsynth.operations.simulation.calibrate_noise import calibrate_noise
@@ -61,6 +63,7 @@ _NAMES = {
     "operations.dataset.index": "verify_dataset",
     "operations.evaluation.conversions": "evaluate_conversions",
     "operations.evaluation.evaluate": "evaluate",
+    "operations.export.export": "export_scene",
     "operations.mesh.extract": "extract_mesh mesh_to_file",
     "operations.mesh.files": "write_mesh",
     "operations.simulation.calibrate_noise": "calibrate_noise",
@@ -75,8 +78,9 @@ _HOMES = {name: module for module, names in _NAMES.items() for name in names.spl
 
 __all__ = [
     "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise", "convert",
-    "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "extract_mesh", "fit", "fit_run", "generate_dataset",
-    "load_recipe", "load_scene", "mesh_to_file", "open_run", "run_batch", "simulate", "verify_dataset", "write_mesh",
+    "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "export_scene", "extract_mesh", "fit", "fit_run",
+    "generate_dataset", "load_recipe", "load_scene", "mesh_to_file", "open_run", "run_batch", "simulate", "verify_dataset",
+    "write_mesh",
 ]  # fmt: skip
 
 

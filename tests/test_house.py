@@ -19,6 +19,7 @@ ROOMS = """
     errors version packaged files toml
     sensors scene field.kernels field fitting
     operations.output operations.views operations.conversion operations.simulation operations.dataset operations.mesh operations.evaluation
+    operations.export
     report workflows bench cli
 """.split()
 

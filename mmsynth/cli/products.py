@@ -1,4 +1,4 @@
-"""Commands that make something of a field: convert, generate-dataset, simulate, calibrate-noise, mesh."""
+"""Commands that make something of a field: convert, generate-dataset, simulate, calibrate-noise, mesh, export."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, modality_names, view_ids
+from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, modality_names, scene_path, view_ids
 from mmsynth.cli.terminal import command, print_written, progress_bar
 from mmsynth.errors import InputError
 
 if TYPE_CHECKING:
     from mmsynth.operations.conversion.methods import Method
     from mmsynth.operations.dataset.plan import DatasetFormat
+    from mmsynth.operations.export.plans import ExportLayout
     from mmsynth.operations.output.records import RecordFormat
     from mmsynth.operations.simulation.simulate import FrameFormat, Split
     from mmsynth.operations.views.load import Rig
@@ -258,3 +259,30 @@ def mesh(
     with progress_bar("mesh", as_json) as show:
         report = mesh_to_file(field, destination, options, scene=scene, against=against, distances=at, progress=show)
     print(json.dumps(report) if as_json else mesh_text(report))
+
+
+@command("export")
+def export(
+    layout: Annotated[str, typer.Option(help="mms-data, nerfstudio or colmap")],
+    source: Annotated[
+        str | None, typer.Argument(metavar="[SCENE|RUN]", help="scene folder, or run folder for poses as the fit corrected them; "
+                                   "default: the last fit made in this folder")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="default: SCENE-LAYOUT in this folder, or RUN/export/LAYOUT")] = None,
+    as_json: JsonOption = False,
+) -> None:  # fmt: skip
+    """Write a scene in another layout: pictures byte for byte, poses, lenses, masks, test views, sparse points."""
+    from mmsynth.operations.export.export import export_scene
+    from mmsynth.report.text import export_text
+    from mmsynth.scene.load import load_scene
+    from mmsynth.workflows.runs import is_run, open_run
+
+    if source is None or is_run(Path(source)):
+        opened = open_run(None if source is None else Path(source))
+        scene, field, destination = opened.scene, opened.field, out or opened.folder / "export" / layout
+    else:
+        scene, field = load_scene(scene_path(source)), None
+        destination = out or Path(f"{scene.root.resolve().name}-{layout}")
+    with progress_bar("export", as_json) as show:
+        written = export_scene(scene, destination, layout=cast("ExportLayout", layout), field=field, progress=show)
+    print(json.dumps(written.facts()) if as_json else export_text(written.facts()))

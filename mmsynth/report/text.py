@@ -115,3 +115,10 @@ def mesh_text(report: Mapping[str, Any]) -> str:
             lines.append(f"note: only {share} of the reference lies in the region of interest; is it in the mesh's frame and in {unit}?")
     lines.append("seconds: " + ", ".join(f"{key} {value:.1f}" for key, value in report["seconds"].items()))
     return "\n".join(lines)
+
+
+def export_text(facts: Mapping[str, Any]) -> str:
+    """What was exported (``Exported.facts``), and a line for everything that did not fit into the layout."""
+    frames = ", ".join(f"{count} of {name}" for name, count in facts["frames"].items())
+    beside = "".join(f", {facts[key]:,} {what}" for key, what in (("masks", "masks"), ("points", "sparse points")) if facts[key])
+    return "\n".join([*(f"note: {note}" for note in facts["notes"]), f"wrote {facts['out']}/ ({facts['layout']}: {frames}{beside})"])

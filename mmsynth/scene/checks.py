@@ -52,6 +52,14 @@ def objects(entry: Mapping[str, Any], key: str, where: str | Path) -> list[dict[
     return value
 
 
+def view_ids(entry: Mapping[str, Any], key: str, where: str | Path) -> list[int]:
+    """``entry[key]`` as a list of whole numbers, empty where the key is missing."""
+    value = entry.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(view, int) and not isinstance(view, bool) for view in value):
+        raise InputError(f"{where}: key '{key}' is not a list of view ids.")
+    return value
+
+
 def numbers(value: Any, otherwise: str) -> np.ndarray:
     """Numbers, in lists or not, as a float64 array, which may hold NaN; ``otherwise``: what the error says."""
     try:

@@ -15,9 +15,10 @@ from mmsynth.files import read_json
 from mmsynth.scene.checks import rigid_pose
 from mmsynth.scene.layouts.colmap import read_images_txt
 from mmsynth.scene.layouts.middlebury import read_middlebury
-from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_reference_poses
-from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_transforms
+from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_mmsdata_points, read_reference_poses
+from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_nerfstudio_points, read_transforms
 from mmsynth.scene.layouts.tum import is_tum, read_tum
+from mmsynth.scene.points import SparsePoints
 from mmsynth.scene.scene import Frame, Region, Scene, StatedPose
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 
@@ -128,6 +129,13 @@ def _read_matrices(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
     if not isinstance(content["rig"], list):
         raise InputError(f"{path}: key 'rig' is not a list of 4x4 matrices.")
     return [StatedPose(None, rigid_pose(matrix, f"{path}: pose {index}"), f"{index:04d}") for index, matrix in enumerate(content["rig"])]
+
+
+def sparse_points(scene: Scene) -> SparsePoints | None:
+    """The sparse points that lie with a scene, in its frame and unit; None where there are none."""
+    readers: dict[str, Callable[[Path], SparsePoints | None]] = {"MMS-DATA": read_mmsdata_points, "nerfstudio": read_nerfstudio_points}
+    read = readers.get(scene.format)
+    return None if read is None else read(scene.root)
 
 
 def sees(frame: Frame, region: Region) -> bool:

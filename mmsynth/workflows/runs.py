@@ -59,6 +59,11 @@ def open_run(folder: Path | None = None, *, device: str = "cpu", masks: MaskMean
     return Run(folder, field, use_masks(scene, masks or stated.get("masks"), mask_folder or (of_fit and Path(of_fit))))
 
 
+def is_run(folder: Path) -> bool:
+    """Whether a fit wrote this folder."""
+    return (folder / "field.safetensors").is_file()
+
+
 def new_run(scene_name: str) -> Path:
     """A run folder that does not exist yet; nothing is created."""
     count = 1

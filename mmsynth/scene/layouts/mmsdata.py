@@ -12,13 +12,16 @@ Facts of the format, and what is made of them:
 
 Optional keys of a modality that MMS-DATA does not have and that describe any other sensor: ``channels`` (labels), ``wavelengths_nm``
 (a number or null per channel), ``polarizer_angles_deg`` (per channel, from image right towards image up). At the top: ``unit``, of the
-frame that ``worldtogt`` leads to, where it is not metres.
+frame that ``worldtogt`` leads to, where it is not metres, and ``test_ids``, the test views of a scene without ground truth images. Lenses
+that MMS-DATA does not have: ``camera_model`` FULL_OPENCV with the eight distortion_params k1 k2 p1 p2 k3 k4 k5 k6, and OPENCV_FISHEYE
+with Kannala-Brandt's k1 k2 k3 k4.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +29,10 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
-from mmsynth.scene.checks import is_file, is_number, make_camera, number, numbers, objects, rigid_pose, whole
+from mmsynth.scene.checks import is_file, is_number, make_camera, number, numbers, objects, rigid_pose, view_ids, whole
 from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import KNOWN, make_sensor, wanted_modalities
+from mmsynth.scene.points import SparsePoints, read_ply_points
 from mmsynth.scene.scene import (
     MAX_VIEW,
     OPENGL_TO_OPENCV,
@@ -44,10 +48,15 @@ from mmsynth.scene.scene import (
     make_split,
 )
 from mmsynth.scene.serialisation import camera_to_json, channels_to_json
-from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.camera import COEFFICIENTS, Camera, Lens
 
 _PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE")
-_MODELS = (*_PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+# distortion_params of each model; the first six are MMS-DATA's
+_MODELS = {
+    **dict.fromkeys((*_PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV"), ("k1", "k2", "p1", "p2", "k3", "k4")),
+    "FULL_OPENCV": COEFFICIENTS["brown_conrady"],
+    "OPENCV_FISHEYE": COEFFICIENTS["kannala_brandt"],
+}
 
 
 def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
@@ -79,13 +88,22 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
             problems.append(f"{name}: {missing} of {missing + len(present)} frames have no image file and are left out.")
         sensors[name] = make_sensor(name, entry, where, read_native(present[0].path), raw)
         frames += present
-    split = _split(root, meta["modalities"], (frame.view for frame in frames))
+    split = _split(root, meta, (frame.view for frame in frames))
     box = meta.get("scene_box")
     radius = number(box if isinstance(box, dict) else {}, "radius", f"{path}: key 'scene_box'", default=1.0)
     if radius <= 0:
         raise InputError(f"{path}: key 'scene_box': radius {radius}, expected a positive number.")
     region = ball(to_output[:3, 3], scale * radius)
     return Scene(root, "MMS-DATA", sensors, tuple(frames), region, split, unit, problems=tuple(problems))
+
+
+def read_mmsdata_points(root: Path) -> SparsePoints | None:
+    """The points of ``pointcloud.ply``, in the frame and unit of ``read_mmsdata``; None where there are none."""
+    points = read_ply_points(root / "pointcloud.ply")
+    if points is None:
+        return None
+    to_output, scale, _ = _world_to_output(_read_meta(root / "meta_data.json"), root / "meta_data.json")
+    return replace(points, positions=scale * points.positions @ to_output[:3, :3].T + to_output[:3, 3])
 
 
 def read_reference_poses(path: Path) -> list[StatedPose]:
@@ -112,8 +130,8 @@ def meta_content(
         root: to name in errors. region: becomes the scene box.
         frames: by sensor and view id, named by their files; poses in the region's frame.
     Raises:
-        InputError: what the format does not hold: a fisheye, k5 or k6, a sensor whose camera changes, frames with all channels
-            at every pixel beside mosaics, of a modality that is known to have one.
+        InputError: what the format does not hold: a sensor whose camera changes, frames with all channels at every pixel beside mosaics,
+            of a modality that is known to have one.
     """
     to_world = np.diag([1.0 / region.radius] * 3 + [1.0])
     to_world[:3, 3] = -np.array(region.centre) / region.radius
@@ -124,14 +142,13 @@ def meta_content(
         if len(cameras) != 1:
             raise InputError(f"{root}: {len(cameras)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames.")
         (camera,) = cameras
-        if camera.lens != "brown_conrady" or any(camera.coefficients[6:]):
-            raise InputError(f"{root}: the lens of '{sensor.name}' does not fit MMS-DATA, which holds Brown-Conrady's k1 k2 p1 p2 k3 k4.")
         if raw and sensor.mosaic is None and sensor.channel_count > 1 and sensor.name in KNOWN:
             raise InputError(f"{root}: '{sensor.name}' has no mosaic, which MMS-DATA does not hold beside sensors that have one.")
+        model = lens_model(camera)
         entry: dict[str, Any] = {
-            "camera_model": "OPENCV",
+            "camera_model": model,
             **{key: value for key, value in camera_to_json(camera).items() if key not in ("lens", "distortion")},
-            "distortion_params": camera.coefficients[:6].tolist(),
+            "distortion_params": camera.coefficients[: len(_MODELS[model])].tolist(),
             **{key: value for key, value in channels_to_json(sensor).items() if value is not None},
         }
         if raw and (sensor.mosaic is not None or sensor.channel_count == 1):
@@ -149,6 +166,13 @@ def meta_content(
         "unit": unit,
         "modalities": modalities,
     }  # fmt: skip
+
+
+def lens_model(camera: Camera) -> str:
+    """The ``camera_model`` of a lens: OPENCV is MMS-DATA's, the two others are known here alone."""
+    if camera.lens == "kannala_brandt":
+        return "OPENCV_FISHEYE"
+    return "FULL_OPENCV" if any(camera.coefficients[6:]) else "OPENCV"
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -199,12 +223,15 @@ def _camera(meta: Mapping[str, Any], entry: Mapping[str, Any], path: Path, where
     distortion: list[float] = []
     if not undistorted and model not in _PINHOLE_MODELS:
         given = entry.get("distortion_params")
-        if not isinstance(given, list) or len(given) != 6 or not all(is_number(value) for value in given):
-            raise InputError(f"{where}: key 'distortion_params' is {given}, expected the six numbers k1 k2 p1 p2 k3 k4.")
+        expected = _MODELS[model]
+        if not isinstance(given, list) or len(given) != len(expected) or not all(is_number(value) for value in given):
+            count = {4: "four", 6: "six", 8: "eight"}[len(expected)]
+            raise InputError(f"{where}: key 'distortion_params' is {given}, expected the {count} numbers {' '.join(expected)}.")
         distortion = [float(value) for value in given]
     size = whole(entry, "width", where), whole(entry, "height", where)
     fx, fy, cx, cy = (number(entry, key, where) for key in ("fx", "fy", "cx", "cy"))
-    return make_camera(where, size, (fx, fy, cx - offset, cy - offset), distortion)
+    lens: Lens = "kannala_brandt" if model == "OPENCV_FISHEYE" else "brown_conrady"
+    return make_camera(where, size, (fx, fy, cx - offset, cy - offset), distortion, lens)
 
 
 def _frames(
@@ -239,8 +266,10 @@ def _stated_frames(entry: Mapping[str, Any], where: str, to_output: np.ndarray, 
         yield view, item["file_name"], to_output @ pose
 
 
-def _split(root: Path, sources: Iterable[str], views: Iterable[int]) -> Split:
-    """Test views: those that have a ground truth image in ``gt/<modality>/``."""
-    folders = [root / "gt" / source for source in sources]
+def _split(root: Path, meta: Mapping[str, Any], views: Iterable[int]) -> Split:
+    """Test views: those of ``test_ids``, else those that have a ground truth image in ``gt/<modality>/``."""
+    if "test_ids" in meta:
+        return make_split(views, view_ids(meta, "test_ids", root / "meta_data.json"), "test_ids")
+    folders = [root / "gt" / source for source in meta["modalities"]]
     stems = {file.stem for folder in folders if folder.is_dir() for file in folder.iterdir()}
     return make_split(views, (int(stem) for stem in stems if stem.isdecimal()), "views in gt/")

@@ -6,8 +6,9 @@
 * Test views: ``test_filenames`` (or all but ``train_filenames``), else ``test_ids``, else every tenth.
 * One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
   says which, and the optional top-level object ``modalities`` describes them with the keys of ``known_sensors.make_sensor``.
-* The region of interest is not in the file: see ``region.region_from_cameras``, and ``region_from_points`` for files with the sparse
-  points of ``ply_file_path`` and for pictures with calibration boards.
+* The region of interest is not in the file, unless its optional key ``region`` has it (``centre`` and ``radius``): see
+  ``region.region_from_cameras``, and ``region_from_points`` for files with the sparse points of ``ply_file_path`` and for pictures with
+  calibration boards. ``unit`` is optional, too.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.capture.boards import board_points
-from mmsynth.scene.checks import is_file, make_camera, number, numbers, objects, rigid_pose, whole
+from mmsynth.scene.checks import is_file, make_camera, number, numbers, objects, rigid_pose, view_ids, whole
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.points import SparsePoints, read_ply_points
 from mmsynth.scene.region import region_from_cameras, region_from_points
 from mmsynth.scene.scene import (
     MAX_VIEW,
@@ -37,9 +39,11 @@ from mmsynth.scene.scene import (
     Sensor,
     Split,
     StatedPose,
+    ball,
     canonical_modality,
     make_split,
 )
+from mmsynth.scene.serialisation import channels_to_json
 from mmsynth.sensors.camera import COEFFICIENTS, Camera, Lens
 
 _BROWN_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -80,12 +84,10 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
     frames = _frames(meta, listed, images, names, sizes, path)
     plain = {source: sensors[names[source]].channel_count for source in sizes if sensors[names[source]].mosaic is None}
     alpha = any(first[source].ndim == 3 and first[source].shape[2] > count for source, count in plain.items())
-    region = _region(meta, root, sensors, frames, problems)
+    region = _stated_region(meta, path) or _region(meta, root, sensors, frames, problems)
     split = _split(meta, frames, path)
-    black = True if alpha else None
-    return Scene(
-        root, "nerfstudio", sensors, tuple(frames), region, split, black_background=black, masks="ignore", problems=tuple(problems)
-    )
+    unit, black = str(meta.get("unit", "input unit")), True if alpha else None
+    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, unit, black, "ignore", problems=tuple(problems))
 
 
 def _source(frame: Mapping[str, Any]) -> str:
@@ -137,30 +139,32 @@ def _frames(
     return frames
 
 
+def _stated_region(meta: Mapping[str, Any], path: Path) -> Region | None:
+    if "region" not in meta:
+        return None
+    where, entry = f"{path}: key 'region'", meta["region"]
+    complaint = f"{where} is {entry!r}, expected an object with 'centre', three numbers, and 'radius'."
+    centre = numbers(entry.get("centre") if isinstance(entry, dict) else None, complaint)
+    if centre.shape != (3,) or not np.isfinite(centre).all():
+        raise InputError(complaint)
+    radius = number(entry, "radius", where, low=0.0)
+    if radius == 0:
+        raise InputError(f"{where}: radius 0, expected a positive number.")
+    return ball(centre, radius)
+
+
 def _region(meta: Mapping[str, Any], root: Path, sensors: Mapping[str, Sensor], frames: Sequence[Frame], problems: list[str]) -> Region:
     """That of the cameras; smaller where the file's sparse points, or calibration boards in the pictures, say so."""
     region = region_from_cameras([frame.camera for frame in frames], [frame.camera_to_world for frame in frames])
     stands = np.stack([frame.camera_to_world[:3, 3] for frame in frames])
     if "ply_file_path" in meta:
-        points = _sparse_points(root / str(meta["ply_file_path"]))
+        points = read_ply_points(root / str(meta["ply_file_path"]))
         if points is not None:
-            return region_from_points(points, region, stands)
+            return region_from_points(points.positions, region, stands)
         problems.append(f"{meta['ply_file_path']}: no readable point cloud, the region of interest is that of the cameras alone")
         return region
     plain = [frame for frame in frames if sensors[frame.sensor].mosaic is None and frame.sensor == frames[0].sensor]
     return region_from_points(board_points(plain), region, stands) if plain else region
-
-
-def _sparse_points(path: Path) -> np.ndarray | None:
-    """(N, 3) finite points of a PLY file; None where there are none."""
-    import trimesh  # takes its time
-
-    try:
-        points = np.asarray(getattr(trimesh.load(path), "vertices", ()), dtype=np.float64)
-    except Exception:  # a file of any kind may stand there, and each of trimesh's readers has its own exceptions
-        return None
-    points = points[np.isfinite(points).all(1)] if points.ndim == 2 and points.shape[1] == 3 else points[:0]
-    return points if len(points) else None
 
 
 def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None:
@@ -181,10 +185,7 @@ def _split(meta: Mapping[str, Any], frames: Sequence[Frame], path: Path) -> Spli
         return make_split(views, (view for name, view in by_name.items() if name in test), "test_filenames")
     if train:
         return make_split(views, (view for name, view in by_name.items() if name not in train), "train_filenames")
-    ids = meta.get("test_ids", [])
-    if not isinstance(ids, list) or not all(isinstance(view, int) for view in ids):
-        raise InputError(f"{path}: key 'test_ids' is not a list of view ids.")
-    return make_split(views, ids, "test_ids")
+    return make_split(views, view_ids(meta, "test_ids", path), "test_ids")
 
 
 def _names(meta: Mapping[str, Any], key: str, path: Path) -> set[str]:
@@ -278,6 +279,34 @@ def _focal(entry: Mapping[str, Any], axis: str, pixels: int, where: str) -> floa
             raise InputError(f"{where}: key 'camera_angle_{axis}' is {angle}, expected an angle between 0 and pi radians.")
         return float(pixels / 2 / np.tan(angle / 2))
     return None
+
+
+def read_nerfstudio_points(root: Path) -> SparsePoints | None:
+    """The points of the file that ``ply_file_path`` of ``transforms.json`` names; None where there are none."""
+    path = root / "transforms.json"
+    named = read_json(path).get("ply_file_path") if path.is_file() else None
+    return None if named is None else read_ply_points(root / str(named))
+
+
+def described_transforms(scene: Scene, listed: Sequence[tuple[Frame, PosedCamera, str | None]]) -> dict[str, Any]:
+    """What ``transforms.json`` says of a scene: ``transforms_content`` with views, split, masks, sensors, and the region of interest.
+
+    Args:
+        listed: frames, each with its camera, named by its file, and the name of its mask.
+    """
+    content = transforms_content([posed for _, posed, _ in listed])
+    for entry, (frame, _, mask) in zip(content["frames"], listed, strict=True):
+        entry |= {"view": frame.view, "modality": frame.sensor} | ({} if mask is None else {"mask_path": mask})
+    named = lambda views: [posed.name for frame, posed, _ in listed if frame.view in views]
+    described = {
+        name: {key: value for key, value in channels_to_json(sensor).items() if value is not None}
+        | ({} if sensor.mosaic is None else {"mosaick_pattern": sensor.mosaic.tolist()})
+        for name, sensor in scene.sensors.items()
+    }
+    return content | {
+        "train_filenames": named(scene.split.train), "test_filenames": named(scene.split.test), "modalities": described,
+        "unit": scene.unit, "region": {"centre": list(scene.region.centre), "radius": scene.region.radius},
+    }  # fmt: skip
 
 
 def transforms_content(views: Sequence[PosedCamera]) -> dict[str, Any]:

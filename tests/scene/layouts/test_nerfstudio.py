@@ -17,6 +17,7 @@ from mmsynth.errors import InputError
 from mmsynth.scene.image_writers import write_exr, write_npz
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.layouts.nerfstudio import read_nerfstudio
+from mmsynth.scene.scene import Region
 from mmsynth.sensors.camera import project
 
 Writer = Callable[..., Path]
@@ -208,3 +209,12 @@ def test_broken_json(write_transforms: Writer) -> None:
     (root / "transforms.json").write_text(json.dumps({"frames": []})[:-2])
     with pytest.raises(InputError, match=r"transforms\.json: not valid JSON at line 1"):
         read_nerfstudio(root)
+
+
+def test_a_stated_region_and_unit_are_taken(write_transforms: Writer) -> None:
+    keys = {"region": {"centre": [0.1, 0.2, 0.3], "radius": 0.7}, "unit": "m"}
+    scene = read_nerfstudio(write_transforms(edit=lambda meta: meta.update(keys)))
+    assert (scene.region, scene.unit) == (Region((0.1, 0.2, 0.3), 0.7), "m")
+    for wrong in (3, {}, {"centre": [0, 0], "radius": 1}, {"centre": [0, 0, 0]}, {"centre": [0, 0, 0], "radius": 0}):
+        with pytest.raises(InputError, match=r"transforms\.json: key 'region'"):
+            read_nerfstudio(write_transforms(edit=lambda meta, wrong=wrong: meta.update(region=wrong)))

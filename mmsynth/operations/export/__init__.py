@@ -1,0 +1,4 @@
+"""A scene, or a run's scene with the poses that the fit corrected, in the layouts of other tools.
+
+``export.export_scene`` plans, copies and writes; what each layout holds is in ``plans``.
+"""

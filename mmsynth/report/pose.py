@@ -1,0 +1,143 @@
+"""The report of ``mmsynth pose``: cameras and points drawn, residuals by picture, and what was left out, as one HTML page."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from mmsynth.files import write_text
+from mmsynth.scene.capture.pose import PosedCapture
+
+_POINTS = 3000  # drawn at the most
+
+_TEMPLATE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff }
+h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #ddd }
+.scroll { overflow-x: auto } table { border-collapse: collapse }
+td, th { padding: .25rem .8rem; border-bottom: 1px solid #eee; text-align: left; vertical-align: top }
+td.number { text-align: right; font-variant-numeric: tabular-nums } svg { max-width: 100%; height: auto } .note { color: #555 }
+</style></head><body>
+<h1>{{ title }}</h1>
+<p>{{ subtitle }}</p>
+{% for note in notes %}<p class="note">{{ note }}</p>
+{% endfor %}
+{% for heading, columns, rows in tables if rows %}<h2>{{ heading }}</h2>
+<div class="scroll"><table><tr>{% for c in columns %}<th>{{ c }}</th>{% endfor %}</tr>
+{% for row in rows %}<tr>{% for v in row %}<td class="number">{{ v }}</td>{% endfor %}</tr>
+{% endfor %}</table></div>{% endfor %}
+<h2>Cameras and points</h2>
+<p class="note">Seen along the mean of the cameras' up axes, and from the side. The circle is the region of interest.</p>
+{{ drawing | safe }}
+<h2>Reprojection error of every picture</h2>
+{{ residuals | safe }}
+</body></html>
+"""
+
+
+def write_pose_report(path: Path, posed: PosedCapture, facts: Mapping[str, Any]) -> Path:
+    """Write the page. ``facts``: what ``workflows.pose.pose_facts`` gives."""
+    sensors = facts["sensors"]
+    intrinsics = [(name, key, f"{value:.6g}") for name, s in sensors.items() for key, value in (s["camera"] or {}).items()]
+    page = {
+        "title": f"Poses of {posed.capture.root.resolve().name}",
+        "subtitle": f"{facts['registered']} of {facts['pictures']} pictures have a pose. Unit: {posed.unit_from}.",
+        "notes": list(posed.notes),
+        "tables": [
+            (
+                "Sensors",
+                ("sensor", "pictures", "with a pose", "points in a picture", "error [px]"),
+                [(n, s["pictures"], s["registered"], f"{s['points']:.0f}", f"{s['error_px']:.3f}") for n, s in sensors.items()],
+            ),
+            ("Left out", ("sensor", "view", "why"), [(e["sensor"], e["view"], e["why"]) for e in facts["left_out"]]),
+            (
+                "The rig, refined",
+                ("sensor", "moved [mm]", "turned [°]"),
+                [(n, f"{1000 * m['length']:.3f}", f"{m['degrees']:.4f}") for n, m in facts["rig_moved"].items()],
+            ),
+            ("Cameras", ("sensor", "", ""), intrinsics),
+        ],
+        "drawing": _drawing(posed),
+        "residuals": _residuals(posed),
+    }
+    write_text(path, jinja2.Environment(autoescape=True).from_string(_TEMPLATE).render(page))
+    return path
+
+
+def _drawing(posed: PosedCapture) -> str:
+    """Cameras by sensor, with their optical axes, before the sparse points, in two directions."""
+    poses = {shot: r.camera_to_world for shot, r in posed.structure.registered.items()}
+    up = -np.mean([pose[:3, 1] for pose in poses.values()], axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    right = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(up, right), up])
+    centre = np.asarray(posed.region.centre)
+    points = posed.structure.points[:: max(1, len(posed.structure.points) // _POINTS)]
+    centres = np.array([pose[:3, 3] for pose in poses.values()])
+    reach = 1.1 * max(float(np.abs(centres - centre).max()), posed.region.radius)
+    length = 0.08 * reach
+    figure = Figure(figsize=(11, 5.5), layout="constrained")
+    for panel, (i, j, title) in zip(figure.subplots(1, 2), ((0, 1, "from above"), (0, 2, "from the side")), strict=True):
+        at = (points - centre) @ axes.T
+        panel.plot(at[:, i], at[:, j], ".", color="#bbb", markersize=1.5, rasterized=False)
+        for k, sensor in enumerate(dict.fromkeys(sensor for sensor, _ in poses)):
+            own = np.array([pose for (name, _), pose in poses.items() if name == sensor])
+            place = (own[:, :3, 3] - centre) @ axes.T
+            tip = place + length * own[:, :3, 2] @ axes.T
+            panel.plot(np.stack([place[:, i], tip[:, i]]), np.stack([place[:, j], tip[:, j]]), color=f"C{k}", linewidth=0.8)
+            panel.plot(place[:, i], place[:, j], "o", color=f"C{k}", markersize=3, label=sensor)
+        angle = np.linspace(0, 2 * np.pi, 100)
+        panel.plot(posed.region.radius * np.cos(angle), posed.region.radius * np.sin(angle), color="#888", linewidth=0.8)
+        panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title=title, xlabel=f"[{posed.unit}]")
+    figure.axes[0].legend(frameon=False)
+    return _svg(figure)
+
+
+def _residuals(posed: PosedCapture) -> str:
+    figure = Figure(figsize=(11, 3), layout="constrained")
+    panel = figure.subplots()
+    registered = posed.structure.registered
+    for sensor in dict.fromkeys(sensor for sensor, _ in registered):
+        own = [(view, r.error) for (name, view), r in registered.items() if name == sensor]
+        panel.plot(*zip(*own, strict=True), ".-", linewidth=0.6, label=sensor)
+    panel.set(xlabel="view", ylabel="rms [px]", ylim=(0, None))
+    panel.grid(alpha=0.25)
+    panel.legend(frameon=False)
+    return _svg(figure)
+
+
+def _svg(figure: Figure) -> str:
+    stream = io.StringIO()
+    FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})
+    text = stream.getvalue()
+    return text[text.index("<svg") :]
+
+
+def pose_text(facts: Mapping[str, Any]) -> str:
+    """What ``pose`` found, in some lines."""
+    lines = [f"note: {note}" for note in facts["notes"]]
+    for name, s in facts["sensors"].items():
+        lines.append(
+            f"{name}: {s['registered']} of {s['pictures']} pictures have a pose, {s['error_px']:.2f} px over {s['points']:.0f} points each"
+        )
+    lines += [f"left out: {entry['sensor']} view {entry['view']}: {entry['why']}" for entry in _shown(facts["left_out"])]
+    lines += [f"{n}: on the rig moved {1000 * m['length']:.2f} mm, {m['degrees']:.3f}°" for n, m in facts["rig_moved"].items()]
+    lines.append(f"unit: {facts['unit_from']}")
+    lines.append(
+        f"{facts['points']} points, {facts['seconds']:.0f} s; wrote {facts['scene']}/ (meta_data.json, modalities, sparse/0, report.html)"
+    )
+    return "\n".join(lines)
+
+
+def _shown(entries: Sequence[Mapping[str, Any]], most: int = 20) -> list[Mapping[str, Any]]:
+    return list(entries[:most])
