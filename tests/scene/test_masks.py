@@ -14,7 +14,7 @@ from conftest import HEIGHT, WIDTH
 from mmsynth.errors import InputError
 from mmsynth.scene.info import describe_scene, render_text
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.masks import find_masks, read_mask, use_masks
+from mmsynth.scene.masks import read_mask, use_masks
 from mmsynth.scene.scene import Scene
 
 INSIDE = np.zeros((HEIGHT, WIDTH), np.uint8)
