@@ -21,7 +21,7 @@ from mmsynth.field.storage import load_field
 from mmsynth.operations.mesh.attributes import training_views
 from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
 from mmsynth.operations.mesh.quality import compare_meshes, describe_mesh, load_reference
-from mmsynth.scene.load import load_scene
+from mmsynth.scene.load import load_again
 from mmsynth.scene.scene import Scene
 
 _BLOCK = 64
@@ -65,7 +65,7 @@ def work(task: Mapping[str, Any], _: Path) -> dict[str, Any]:
         InputError: no such run, scene or reference, or nothing to mesh.
     """
     field = load_field(Path(task["run"]))
-    scene = load_scene(Path(field.manifest["scene"]["path"]), modalities=list(field.sensors))
+    scene = load_again(field.manifest["scene"], modalities=list(field.sensors))
     reference = None if task["against"] is None else load_reference(Path(task["against"]))
     began, cpu = time.perf_counter(), time.process_time()
     mesh = METHODS[task["method"]](field, scene, task["resolution"])

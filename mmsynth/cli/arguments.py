@@ -19,6 +19,17 @@ JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object 
 SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="scene folder, or `example` for the packaged scene")]
 RecipeOption = Annotated[str | None, typer.Option(help="packaged recipe or TOML file")]
 ModalitiesOption = Annotated[str | None, typer.Option(help="fit these only, e.g. rgb,ms")]
+LayoutOption = Annotated[
+    str | None, typer.Option(help="MMS-DATA, nerfstudio, Blender, COLMAP, NeuS or Middlebury; default: the one that the folder holds")
+]
+ImagesOption = Annotated[Path | None, typer.Option(help="folder where the pictures are; default: where the scene's files say")]
+AlsoOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=FOLDER[:calibration.json]",
+        help="one more sensor, pictures of the same names in another folder, with its own camera and place or those of the first sensor",
+    ),
+]
 FramesOption = Annotated[
     str | None, typer.Option(help="number of training frames to keep of some modalities, e.g. pol=3,ms=5; default: all")
 ]
@@ -59,6 +70,16 @@ def frame_limits(text: str | None) -> dict[str, int]:
             raise InputError(f"--frames {text!r}: expected a number of frames per modality, each once, such as pol=3,ms=5.")
         limits[name] = int(match[2])
     return limits
+
+
+def sensor_folders(given: list[str] | None) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for text in given or ():
+        name, equals, folder = text.partition("=")
+        if not equals or not name.strip() or not folder.strip() or name.strip() in found:
+            raise InputError(f"--also {text!r}: expected a sensor and a folder, each sensor once, such as nir=FOLDER.")
+        found[name.strip()] = folder.strip()
+    return found
 
 
 def modality_pairs(text: str, known: list[str]) -> list[tuple[str, str]]:

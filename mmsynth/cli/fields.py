@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from mmsynth.cli.arguments import (
+    AlsoOption,
     DeviceOption,
     FramesOption,
+    ImagesOption,
     JsonOption,
+    LayoutOption,
     MasksOption,
     ModalitiesOption,
     RecipeOption,
@@ -23,6 +26,7 @@ from mmsynth.cli.arguments import (
     modality_names,
     modality_pairs,
     scene_path,
+    sensor_folders,
 )
 from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
@@ -33,13 +37,21 @@ if TYPE_CHECKING:
 
 
 @command("info")
-def info(scene: SceneArgument, masks: MasksOption = None, as_json: JsonOption = False) -> None:
+def info(
+    scene: SceneArgument,
+    layout: LayoutOption = None,
+    images: ImagesOption = None,
+    also: AlsoOption = None,
+    masks: MasksOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
     from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.masks import use_masks
 
-    description = describe_scene(use_masks(load_scene(scene_path(scene)), *masks_of(masks)))
+    read = load_scene(scene_path(scene), layout=layout, images=images, also=sensor_folders(also))
+    description = describe_scene(use_masks(read, *masks_of(masks)))
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -50,6 +62,9 @@ def fit(
     recipe: RecipeOption = None,
     modalities: ModalitiesOption = None,
     frames: FramesOption = None,
+    layout: LayoutOption = None,
+    images: ImagesOption = None,
+    also: AlsoOption = None,
     masks: MasksOption = None,
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
@@ -70,8 +85,8 @@ def fit(
     from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    loaded = load_scene(scene_path(scene), modalities=modality_names(modalities))
-    loaded = use_masks(keep_frames(loaded, frame_limits(frames)), *masks_of(masks))
+    read = load_scene(scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also))
+    loaded = use_masks(keep_frames(read, frame_limits(frames)), *masks_of(masks))
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")

@@ -25,7 +25,7 @@ from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.scene.scene import Scene
-from mmsynth.scene.serialisation import CONVENTIONS
+from mmsynth.scene.serialisation import CONVENTIONS, source_to_json
 from mmsynth.version import __version__
 
 CHECKPOINT_SECONDS = 60.0
@@ -128,12 +128,9 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
     return {
         "mmsynth": __version__,
         "scene": {
-            "path": str(scene.root.resolve()),
-            "format": scene.format,
+            **source_to_json(scene),
             "hash": trainer.task["scene"],
             "test_views": list(scene.split.test),
-            "masks": scene.masks,
-            "mask_folder": None if scene.mask_folder is None else str(scene.mask_folder.resolve()),
         },
         "recipe": trainer.recipe.model_dump(),
         "needs": asdict(replace(trainer.needs, choices=trainer.choices)),

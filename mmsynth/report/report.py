@@ -267,12 +267,12 @@ def write_run_report(
 
 
 def _scene_of(manifest: Mapping[str, Any]) -> Scene | None:
-    from mmsynth.scene.load import load_scene
+    from mmsynth.scene.load import load_again
 
-    path = manifest.get("scene", {}).get("path")
-    if not path:
+    stated = manifest.get("scene", {})
+    if not stated.get("path"):
         return None
     try:
-        return load_scene(Path(path))
+        return load_again(stated)
     except InputError:
         return None

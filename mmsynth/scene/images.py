@@ -4,7 +4,8 @@ Values are taken as they are: a uint8 file is divided by 255 and a uint16 file b
 (12-bit data must be stored left-aligned), a float file is not scaled at all and may exceed 1. No gamma is removed: an
 8-bit sRGB photo stays gamma-encoded, and a field learned from it predicts gamma-encoded values.
 
-``cv2`` silently returns the readable part of a damaged file, so PNG chunks (with CRC) and JPEG markers are checked here.
+``cv2`` silently returns the readable part of some damaged files, so PNG chunks (with CRC), JPEG markers and the lengths that WebP and BMP
+files state are checked here.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ import tifffile
 from mmsynth.errors import InputError
 from mmsynth.scene.scene import Frame, Sensor
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".npy", ".npz", ".exr")
+_GREY = 12 / 255  # spread of the channels of a grey picture: lossy WebP leaves up to 9 codes
+_CHECKED = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
+_BY_OPENCV = (
+    ".jpe", ".apng", ".dib", ".jp2", ".avif", ".gif", ".pbm", ".pgm", ".ppm", ".pnm", ".pam", ".pfm", ".sr", ".ras", ".hdr", ".pic",
+)  # fmt: skip
+SUFFIXES = (*_CHECKED, ".tif", ".tiff", ".dng", ".npy", ".npz", ".exr", *_BY_OPENCV)
+"""Of image files, in the order in which they are tried where a name has none."""
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -35,7 +42,7 @@ def read_image(path: Path) -> np.ndarray:
     (2 before 10); an npz file holds the image under the key ``data``.
 
     Args:
-        path: png, jpg, tif (uint8, uint16 or float), npy, npz (the same) or exr.
+        path: tif (uint8, uint16 or float), npy, npz (the same), exr, or what OpenCV reads: png, jpg, webp, bmp, ...
     Returns:
         (H, W) or (H, W, C) float32.
     Raises:
@@ -83,22 +90,39 @@ def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndar
 
 
 def check_file(path: Path) -> None:
-    """Check that a PNG or JPEG file is complete, without decoding it; other types are only checked to exist.
+    """Check that a picture is complete: PNG, JPEG, WebP and BMP without decoding it; arrays, TIFF and EXR are only checked to exist.
 
     Raises:
         InputError: missing, truncated or damaged.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such image file.")
-    if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+    if path.suffix.lower() in _CHECKED:
         _check_photo(path.read_bytes(), path)
+    elif path.suffix.lower() in _BY_OPENCV:
+        read_native(path)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height, of most types without decoding the pixels; errors as ``read_image``."""
+    from PIL import Image, UnidentifiedImageError
+
+    if path.suffix.lower() in (*_CHECKED, *_BY_OPENCV):
+        try:
+            with Image.open(path) as image:
+                return image.size
+        except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError):
+            pass  # what Pillow does not know, or damage, which the reader names
+    height, width = read_native(path).shape[:2]
+    return width, height
 
 
 def load_frame(sensor: Sensor, frame: Frame) -> tuple[np.ndarray, np.ndarray | None]:
     """Read a frame and check it against its camera and sensor.
 
     Returns:
-        pixels: (H, W) float32 for a mosaicked sensor (raw, never demosaicked), else (H, W, C), C = 1 for mono.
+        pixels: (H, W) float32 for a mosaicked sensor (raw, never demosaicked), else (H, W, C), C = 1 for mono. A grey picture that is
+            stored as colour, for a sensor of one channel, is the mean of its channels.
         alpha: (H, W) float32 where the file has one channel more than a 1- or 3-channel sensor, else None. Colours are not
             multiplied by it.
     Raises:
@@ -121,9 +145,16 @@ def load_frame(sensor: Sensor, frame: Frame) -> tuple[np.ndarray, np.ndarray | N
         return image, None
     if count in (1, 3) and image.shape[2] == count + 1:
         return np.ascontiguousarray(image[..., :count]), np.ascontiguousarray(image[..., count])
-    if count == 1 and image.shape[2] == 4 and np.array_equal(image[..., 0], image[..., 1]) and np.array_equal(image[..., 0], image[..., 2]):
-        return np.ascontiguousarray(image[..., :1]), np.ascontiguousarray(image[..., 3])  # cv2 expands grey + alpha to four channels
+    if count == 1 and image.shape[2] in (3, 4) and is_grey(image):
+        alone = image[..., :1] if np.ptp(image[..., :3], axis=2).max() == 0 else image[..., :3].mean(2, keepdims=True)
+        return np.ascontiguousarray(alone), np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
     raise InputError(f"{frame.path}: {image.shape[2]} channels, expected {count} for '{sensor.name}'.")
+
+
+def is_grey(image: np.ndarray) -> bool:
+    """Whether the first three channels (H, W, C) are one, but for what lossy compression of a grey picture makes of them."""
+    scale = np.iinfo(image.dtype).max if image.dtype.kind == "u" else 1.0
+    return bool(np.ptp(image[..., :3].astype(np.float32), axis=2).max() <= _GREY * scale)
 
 
 def used_bits(raw: np.ndarray) -> int:
@@ -153,10 +184,14 @@ def saturation_level(raw: np.ndarray) -> float:
 def _read_photo(path: Path) -> np.ndarray:
     data = path.read_bytes()
     _check_photo(data, path)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said below, in one sentence
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if image is None:
         raise InputError(f"{path}: damaged image, could not be decoded.")
-    if image.ndim == 2:
+    if image.ndim == 2 or image.shape[2] not in (3, 4):
         return np.asarray(image)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
@@ -220,8 +255,17 @@ def _check_photo(data: bytes, path: Path) -> None:
         _check_png(data, path)
     elif data[:2] == b"\xff\xd8":
         _check_jpeg(data, path)
-    else:
-        raise InputError(f"{path}: damaged image, neither PNG nor JPEG data.")
+    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        _check_length(data, 8 + int.from_bytes(data[4:8], "little"), path)
+    elif data[:2] == b"BM" and len(data) >= 14:
+        _check_length(data, int.from_bytes(data[2:6], "little"), path)
+    elif path.suffix.lower() in _CHECKED:
+        raise InputError(f"{path}: damaged image, neither PNG, JPEG, WebP nor BMP data.")
+
+
+def _check_length(data: bytes, stated: int, path: Path) -> None:
+    if len(data) < stated:
+        raise InputError(f"{path}: truncated image, the file has {len(data)} of the {stated} bytes that it states.")
 
 
 def _check_png(data: bytes, path: Path) -> None:

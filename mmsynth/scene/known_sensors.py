@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.scene.images import saturation_level
+from mmsynth.scene.images import is_grey, saturation_level
 from mmsynth.scene.scene import Sensor, canonical_modality
 from mmsynth.sensors.mosaic import pattern_of
 
@@ -71,6 +71,8 @@ def make_sensor(name: str, entry: Mapping[str, Any], where: str, image: np.ndarr
         expected = len(entry.get("channels", known.get("channels", ())))
         if (count == 2 and expected in (0, 1)) or (count == 4 and expected in (0, 1, 3)):
             count = expected or count - 1
+        elif count == 3 and expected == 1 and is_grey(image):
+            count = 1
     labels = entry.get("channels")
     if labels is None:
         plain = {1: (name,), 3: ("R", "G", "B")}.get(count, tuple(map(str, range(count))))

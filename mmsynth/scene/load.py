@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,33 +13,96 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
+from mmsynth.scene.also import stated_source, with_sensors
 from mmsynth.scene.checks import rigid_pose
-from mmsynth.scene.layouts.colmap import read_images_txt
+from mmsynth.scene.layouts.blender import SPLITS, file_of, read_blender
+from mmsynth.scene.layouts.colmap import models_in, read_colmap, read_colmap_points
+from mmsynth.scene.layouts.colmap_model import read_model_poses
 from mmsynth.scene.layouts.middlebury import read_middlebury
 from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_mmsdata_points, read_reference_poses
 from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_nerfstudio_points, read_transforms
+from mmsynth.scene.layouts.neus import cameras_of, read_neus
 from mmsynth.scene.layouts.tum import is_tum, read_tum
+from mmsynth.scene.masks import use_masks
 from mmsynth.scene.points import SparsePoints
-from mmsynth.scene.scene import Frame, Region, Scene, StatedPose
+from mmsynth.scene.scene import Frame, Layout, MaskMeaning, Region, Scene, SceneSource, StatedPose
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 
 _ROUND_TRIP = 1e-3  # pixels
 
 
-def load_scene(path: Path | str, *, modalities: Sequence[str] | None = None) -> Scene:
+@dataclass(frozen=True)
+class _Reader:
+    """How a layout is recognised in a folder, and read: (folder or file, modalities, folder of the pictures) -> Scene."""
+
+    marks: str
+    is_in: Callable[[Path], bool]
+    read: Callable[[Path, Sequence[str] | None, Path | None], Scene]
+
+
+# of two layouts with as many pictures, the first is taken
+_READERS: dict[Layout, _Reader] = {
+    "MMS-DATA": _Reader("meta_data.json", lambda root: (root / "meta_data.json").is_file(), read_mmsdata),
+    "nerfstudio": _Reader("transforms.json", lambda root: (root / "transforms.json").is_file(), read_nerfstudio),
+    "Blender": _Reader("transforms_train.json", lambda root: any(file_of(root, split).is_file() for split in SPLITS), read_blender),
+    "COLMAP": _Reader("sparse/0", lambda root: bool(models_in(root)), read_colmap),
+    "NeuS": _Reader("cameras_sphere.npz", lambda root: cameras_of(root) is not None, read_neus),
+    "Middlebury": _Reader("*_par.txt", lambda root: any(root.glob("*_par.txt")), read_middlebury),
+}
+
+
+def load_scene(
+    path: Path | str,
+    *,
+    modalities: Sequence[str] | None = None,
+    layout: str | None = None,
+    images: Path | str | None = None,
+    also: Mapping[str, str] | None = None,
+) -> Scene:
     """Read a scene; its layout is recognised by the files in the folder.
 
-    ``meta_data.json``: MMS-DATA; ``transforms.json``: nerfstudio or instant-ngp; ``*_par.txt``: Middlebury.
+    ``meta_data.json``: MMS-DATA; ``transforms.json``: nerfstudio or instant-ngp; ``transforms_train.json`` ...: NeRF-synthetic (Blender);
+    ``sparse/0`` ...: COLMAP; ``cameras_sphere.npz``: NeuS, IDR; ``*_par.txt``: Middlebury. Of several in one folder that with more
+    pictures is read, and ``Scene.problems`` says so. A ``scene.toml`` in the folder may hold ``layout``, ``images`` and ``also``; what is
+    given here wins.
 
     Args:
         path: the scene's folder, or one of these JSON files.
         modalities: names or aliases of the sensors to read; None: all.
+        layout: name of a layout, in any case; None: the one that the folder holds.
+        images: folder where the pictures are, by the names that the metadata give them, with any suffix; None: where the metadata say.
+        also: more sensors of a layout made for one, by name, ``FOLDER`` or ``FOLDER:calibration.json``, see ``scene.also``.
+            Folders are relative to the scene's folder, or else to the working folder.
     Raises:
         InputError: nothing there, unknown format or modality, bad metadata, fewer than two frames to train on, or no
             camera that sees the region of interest.
     """
-    path = Path(path)
-    scene = _reader(path)(path.parent if path.name == "meta_data.json" else path, modalities)
+    source = stated_source(Path(path), layout, images, also)
+    scene = _read(source, None if source.also else modalities)
+    scene = with_sensors(scene, dict(source.also), modalities)
+    return dataclasses.replace(_checked(scene, source.path), source=source)
+
+
+def load_again(
+    stated: Mapping[str, Any],
+    *,
+    modalities: Sequence[str] | None = None,
+    masks: MaskMeaning | None = None,
+    mask_folder: Path | None = None,
+) -> Scene:
+    """Read the scene of a run again: ``stated`` is what its manifest says of the scene (``serialisation.source_to_json``).
+
+    Args:
+        masks, mask_folder: see ``use_masks``; None: as the manifest has them.
+    """
+    how = {key: stated.get(key) for key in ("images", "also")}
+    scene = load_scene(stated["path"], modalities=modalities, layout=stated.get("format"), **how)
+    of_fit = stated.get("mask_folder")
+    return use_masks(scene, masks or stated.get("masks"), mask_folder or (Path(of_fit) if of_fit else None))
+
+
+def _checked(scene: Scene, path: Path) -> Scene:
+    """The scene with what is to be said of it; refused where nothing can be learned."""
     training = [frame for frame in scene.frames if frame.view in scene.split.train]
     if len(training) < 2:
         raise InputError(f"{path}: {len(training)} frames to train on ({len(scene.frames)} in all), expected at least 2.")
@@ -60,22 +124,45 @@ def load_scene(path: Path | str, *, modalities: Sequence[str] | None = None) -> 
     return dataclasses.replace(scene, problems=tuple(problems))
 
 
-def _reader(path: Path) -> Callable[[Path, Sequence[str] | None], Scene]:
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder.")
+def _read(source: SceneSource, modalities: Sequence[str] | None) -> Scene:
+    path, images = source.path, source.images
     if path.is_file():
+        name: Layout = "MMS-DATA" if path.name == "meta_data.json" else "nerfstudio"
         if path.suffix.lower() != ".json":
             raise InputError(f"{path}: not a scene, expected a folder or its JSON file.")
-        return read_mmsdata if path.name == "meta_data.json" else read_nerfstudio
-    if (path / "meta_data.json").is_file():
-        return read_mmsdata
-    if (path / "transforms.json").is_file():
-        return read_nerfstudio
-    if any(path.glob("*_par.txt")):
-        return read_middlebury
-    if (path / "calibration.json").is_file():
+        if source.layout not in (None, name):
+            raise InputError(f"{path}: a file of the layout {name}, expected the folder for the layout {source.layout}.")
+        return _READERS[name].read(path.parent if name == "MMS-DATA" else path, modalities, images)
+    if source.layout is not None:
+        reader = _READERS[source.layout]
+        if not reader.is_in(path):
+            raise InputError(f"{path}: no {reader.marks} in it, expected the layout {source.layout}.")
+        return reader.read(path, modalities, images)
+    held = [name for name, reader in _READERS.items() if reader.is_in(path)]
+    if not held and (path / "calibration.json").is_file():
         raise InputError(f"{path}: calibration.json without meta_data.json is an MMS-DATA source scene, which has no camera poses.")
-    raise InputError(f"{path}: not a scene, expected meta_data.json (MMS-DATA), transforms.json (nerfstudio) or *_par.txt (Middlebury).")
+    if not held:
+        known = ", ".join(f"{reader.marks} ({name})" for name, reader in _READERS.items())
+        raise InputError(f"{path}: not a scene, expected {known}.")
+    return _READERS[held[0]].read(path, modalities, images) if len(held) == 1 else _richest(path, held, modalities, images)
+
+
+def _richest(path: Path, held: Sequence[Layout], modalities: Sequence[str] | None, images: Path | None) -> Scene:
+    """The scene with the most pictures of a folder that holds several layouts."""
+    found: dict[Layout, Scene] = {}
+    refused: dict[Layout, InputError] = {}
+    for name in held:
+        try:
+            found[name] = _READERS[name].read(path, modalities, images)
+        except InputError as error:
+            refused[name] = error
+    if not found:
+        raise next(iter(refused.values()))
+    taken = max(found, key=lambda name: len(found[name].frames))
+    others = [f"{name} with {len(scene.frames)}" for name, scene in found.items() if name != taken]
+    others += [f"{name}, which cannot be read ({str(error).rstrip('.')})" for name, error in refused.items()]
+    note = f"read as {taken}, {len(found[taken].frames)} pictures; the folder also holds {', '.join(others)}: --layout NAME decides."
+    return dataclasses.replace(found[taken], problems=(note, *found[taken].problems))
 
 
 def read_poses(path: Path) -> list[StatedPose]:
@@ -101,7 +188,7 @@ def read_poses(path: Path) -> list[StatedPose]:
     if is_tum(path):
         poses = read_tum(path)
     elif path.suffix.lower() == ".txt":
-        poses = read_images_txt(path)
+        poses = read_model_poses(path)
     else:
         content = read_json(path)
         if not isinstance(content, dict):
@@ -133,6 +220,8 @@ def _read_matrices(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
 
 def sparse_points(scene: Scene) -> SparsePoints | None:
     """The sparse points that lie with a scene, in its frame and unit; None where there are none."""
+    if scene.format == "COLMAP":
+        return read_colmap_points(scene.root, scene.source.images if scene.source else None)
     readers: dict[str, Callable[[Path], SparsePoints | None]] = {"MMS-DATA": read_mmsdata_points, "nerfstudio": read_nerfstudio_points}
     read = readers.get(scene.format)
     return None if read is None else read(scene.root)

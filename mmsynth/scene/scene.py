@@ -20,7 +20,7 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.sensors.camera import Camera
 
-Layout = Literal["MMS-DATA", "nerfstudio", "Middlebury"]
+Layout = Literal["MMS-DATA", "nerfstudio", "Blender", "COLMAP", "NeuS", "Middlebury"]
 MaskMeaning = Literal["object", "ignore", "off"]
 """What masks say of the pixels outside: nothing is there (opacity 0, and 1 inside); not to be learned from; nothing, they only score."""
 
@@ -157,6 +157,23 @@ def make_split(views: Iterable[int], test: Iterable[int] = (), source: str = "")
 
 
 @dataclass(frozen=True)
+class SceneSource:
+    """All that it takes to read a scene again, as ``load_scene`` takes it and ``scene.toml`` adds to it; paths are absolute.
+
+    Attributes:
+        path: the folder or file.
+        layout: None: the one that the folder holds.
+        images: folder where the pictures are; None: where the layout says.
+        also: folders of more sensors, by name, see ``scene.also``.
+    """
+
+    path: Path
+    layout: Layout | None = None
+    images: Path | None = None
+    also: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
 class Scene:
     """Everything a reader found.
 
@@ -170,6 +187,7 @@ class Scene:
             None when it does not say.
         masks: what the frames' masks mean. mask_folder: where they were sought; None: where the layout has them.
         problems: one sentence each, to be shown by ``mmsynth info`` (missing images, dropped frames, ...).
+        source: from what it was read; None where it was made in memory.
     """
 
     root: Path
@@ -183,6 +201,7 @@ class Scene:
     masks: MaskMeaning = "off"
     mask_folder: Path | None = None
     problems: tuple[str, ...] = ()
+    source: SceneSource | None = None
 
     def frames_of(self, sensor: str, views: tuple[int, ...] | None = None) -> tuple[Frame, ...]:
         """Frames of one sensor, optionally of some views only, in view order."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mmsynth.scene.scene import PosedCamera, Sensor
+from mmsynth.scene.scene import PosedCamera, Scene, SceneSource, Sensor
 from mmsynth.sensors.camera import Camera
 
 CONVENTIONS = {
@@ -43,6 +43,19 @@ def posed_to_json(posed: PosedCamera) -> dict[str, Any]:
 def posed_from_json(stated: Mapping[str, Any]) -> PosedCamera:
     """What ``posed_to_json`` wrote, without a name."""
     return PosedCamera(camera_from_json(stated), np.array(stated["camera_to_world"], dtype=np.float64))
+
+
+def source_to_json(scene: Scene) -> dict[str, Any]:
+    """Where a scene is and how it was read, for ``load.load_again``."""
+    source = scene.source or SceneSource(scene.root.resolve())
+    stated: dict[str, Any] = {"path": str(source.path), "format": scene.format, "masks": scene.masks}
+    if scene.mask_folder is not None:
+        stated["mask_folder"] = str(scene.mask_folder.resolve())
+    if source.images is not None:
+        stated["images"] = str(source.images)
+    if source.also:
+        stated["also"] = dict(source.also)
+    return stated
 
 
 def channels_to_json(sensor: Sensor) -> dict[str, Any]:

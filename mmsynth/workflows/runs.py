@@ -13,8 +13,7 @@ from typing import Any
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
-from mmsynth.scene.load import load_scene
-from mmsynth.scene.masks import use_masks
+from mmsynth.scene.load import load_again
 from mmsynth.scene.scene import MaskMeaning, Scene
 
 _RUNS = Path("runs")
@@ -53,10 +52,8 @@ def open_run(folder: Path | None = None, *, device: str = "cpu", masks: MaskMean
         InputError: as ``open_field``, or the scene or its masks cannot be read.
     """
     folder, field = open_field(folder, device=device)
-    stated = field.manifest["scene"]
-    scene = load_scene(Path(stated["path"]), modalities=list(field.sensors))
-    of_fit = stated.get("mask_folder")
-    return Run(folder, field, use_masks(scene, masks or stated.get("masks"), mask_folder or (of_fit and Path(of_fit))))
+    scene = load_again(field.manifest["scene"], modalities=list(field.sensors), masks=masks, mask_folder=mask_folder)
+    return Run(folder, field, scene)
 
 
 def is_run(folder: Path) -> bool:

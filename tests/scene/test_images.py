@@ -12,7 +12,7 @@ import tifffile
 
 from mmsynth.errors import InputError
 from mmsynth.scene.image_writers import write_exr, write_npz, write_png16, write_tiff16
-from mmsynth.scene.images import check_file, load_frame, read_image, saturation_level, used_bits
+from mmsynth.scene.images import SUFFIXES, check_file, image_size, load_frame, read_image, saturation_level, used_bits
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 
@@ -122,7 +122,7 @@ def test_nan_pixel_is_named(tmp_path: Path) -> None:
 
 def test_unknown_type_and_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="unknown image type"):
-        read_image(tmp_path / "a.bmp")
+        read_image(tmp_path / "a.txt")
     with pytest.raises(InputError, match="no such image file"):
         read_image(tmp_path / "a.png")
     np.save(tmp_path / "a.npy", np.zeros((2, 2), np.int32))
@@ -173,3 +173,85 @@ def test_nothing_is_left_behind_when_a_writer_refuses(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="could not be written"):
         write_exr(tmp_path / "a.exr", {"Y": COLOUR[..., 0]})
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+BYTES = (COLOUR * 255).astype(np.uint8)
+LARGE = np.random.default_rng(2).random((48, 40, 3)).astype(np.float32)  # JPEG 2000 needs more than a few pixels
+LARGE_BYTES = (LARGE * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".bmp", ".ppm", ".ras", ".jp2", ".png", ".apng"])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_what_opencv_writes_without_loss_is_read(tmp_path: Path, suffix: str, channels: int) -> None:
+    if channels == 4 and suffix in (".ppm", ".ras", ".jp2"):
+        pytest.skip("has no alpha")
+    alpha = np.maximum(LARGE_BYTES[..., :1], 1)  # WebP forgets colours that cannot be seen
+    image = np.dstack([LARGE_BYTES, alpha])[..., :channels]
+    file = tmp_path / f"a{suffix}"
+    quality = {".webp": [cv2.IMWRITE_WEBP_QUALITY, 101], ".jp2": [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, 1000]}.get(suffix, [])
+    cv2.imwrite(str(file), image[..., [2, 1, 0, 3][:channels]], quality)
+    np.testing.assert_array_equal(np.rint(read_image(file) * 255), image)
+    check_file(file)
+    assert image_size(file) == (40, 48)
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".pfm"])
+def test_float_files_are_not_scaled(tmp_path: Path, suffix: str) -> None:
+    cv2.imwrite(str(tmp_path / f"a{suffix}"), COLOUR[..., ::-1] * 7)
+    np.testing.assert_allclose(read_image(tmp_path / f"a{suffix}"), COLOUR * 7, atol=0.06 if suffix == ".hdr" else 0)
+    assert image_size(tmp_path / f"a{suffix}") == (5, 6)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".bmp", ".dib", ".ppm", ".pgm", ".pfm", ".hdr", ".ras", ".jp2", ".gif", ".avif"])
+def test_a_part_of_any_file_is_refused_without_noise(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
+    image = (LARGE if suffix in (".hdr", ".pfm") else LARGE_BYTES)[..., 0 if suffix == ".pgm" else slice(None)]
+    try:
+        cv2.imwrite(str(tmp_path / f"a{suffix}"), image)
+    except cv2.error:
+        pytest.skip("not in this build of OpenCV")
+    data = (tmp_path / f"a{suffix}").read_bytes()
+    for length in {*range(0, len(data), max(1, len(data) // 12)), len(data) - 1}:
+        (tmp_path / f"a{suffix}").write_bytes(data[:length])
+        for read in (read_image, check_file):
+            with pytest.raises(InputError, match=rf"a\{suffix}: "):
+                read(tmp_path / f"a{suffix}")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_every_type_that_opencv_reads_has_its_suffix() -> None:
+    """jpe, tif and exr beside them; a mosaic in a video is none."""
+    known = {
+        ".bmp",
+        ".dib",
+        ".jpg",
+        ".jpeg",
+        ".jpe",
+        ".jp2",
+        ".png",
+        ".webp",
+        ".avif",
+        ".pbm",
+        ".pgm",
+        ".ppm",
+        ".pnm",
+        ".pfm",
+        ".sr",
+        ".ras",
+    }
+    assert known | {".tif", ".tiff", ".exr", ".hdr", ".pic", ".gif"} <= set(SUFFIXES)
+
+
+def test_grey_pictures_stored_as_colour(tmp_path: Path) -> None:
+    """Lossy compression leaves some codes between the channels; a coloured picture is still refused."""
+    nir, camera = Sensor("nir", ("nir",), (None,)), Camera(5, 6, 5.0, 5.0, 2.0, 2.0)
+    grey = np.dstack([BYTES[..., 0] // 2] * 3)
+    for spread, channels in ((0, 3), (0, 4), (9, 3), (9, 4)):
+        image = np.dstack([grey, BYTES[..., :1]])[..., :channels].copy()
+        image[2, 3, 1] += spread
+        cv2.imwrite(str(tmp_path / "a.png"), image)
+        pixels, alpha = load_frame(nir, Frame("nir", 0, tmp_path / "a.png", camera, np.eye(4)))
+        np.testing.assert_allclose(pixels[..., 0], image[..., :3].mean(2) / 255, atol=1e-6)
+        assert (alpha is not None) == (channels == 4)
+    cv2.imwrite(str(tmp_path / "a.png"), BYTES)
+    with pytest.raises(InputError, match="3 channels, expected 1"):
+        load_frame(nir, Frame("nir", 0, tmp_path / "a.png", camera, np.eye(4)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,8 @@ from conftest import OPENCV_TO_OPENGL, look_at
 
 from mmsynth.errors import InputError
 from mmsynth.scene.info import describe_scene, render_text
-from mmsynth.scene.load import load_scene
+from mmsynth.scene.load import load_again, load_scene
+from mmsynth.scene.serialisation import source_to_json
 
 Writer = Callable[..., Path]
 
@@ -27,6 +29,45 @@ def test_picks_the_reader(write_mmsdata: Writer) -> None:
 def test_picks_nerfstudio(write_transforms: Writer) -> None:
     root = write_transforms()
     assert load_scene(root).format == load_scene(root / "transforms.json").format == "nerfstudio"
+
+
+def test_of_two_layouts_the_one_with_more_pictures(write_transforms: Writer) -> None:
+    root = write_transforms(count=5)
+    meta = json.loads((root / "transforms.json").read_text())
+    (root / "transforms_train.json").write_text(json.dumps({**meta, "frames": meta["frames"][:4]}))
+    scene = load_scene(root)
+    assert scene.format == "nerfstudio"
+    assert scene.problems == ("read as nerfstudio, 5 pictures; the folder also holds Blender with 4: --layout NAME decides.",)
+    assert load_scene(root, layout="blender").format == "Blender" and load_scene(root, layout="blender").problems == ()
+    (root / "transforms.json").write_text("{}")
+    scene = load_scene(root)
+    assert scene.format == "Blender" and "nerfstudio, which cannot be read" in scene.problems[0]
+    for layout, said in (("COLMAP", r"no sparse/0 in it, expected the layout COLMAP"), ("foo", "no such layout, expected one of MMS-DATA")):
+        with pytest.raises(InputError, match=said):
+            load_scene(root, layout=layout)
+    with pytest.raises(InputError, match="a file of the layout nerfstudio, expected the folder for the layout Blender"):
+        load_scene(root / "transforms_train.json", layout="blender")
+
+
+def test_a_scene_in_one_file_is_read_again_from_it(write_transforms: Writer) -> None:
+    """Not from the folder's transforms.json."""
+    root = write_transforms(count=5)
+    meta = json.loads((root / "transforms.json").read_text())
+    (root / "less.json").write_text(json.dumps({**meta, "frames": meta["frames"][:4]}))
+    again = load_again(source_to_json(load_scene(root / "less.json")))
+    assert len(again.frames) == 4
+
+
+def test_pictures_of_another_size_have_their_cameras_scaled(write_transforms: Writer) -> None:
+    root = write_transforms()
+    full = load_scene(root).frames[0].camera
+    for file in (root / "images").iterdir():
+        cv2.imwrite(str(file), np.zeros((9, 12, 3), np.uint8))
+    scene = load_scene(root)
+    assert scene.frames[0].camera == dataclasses.replace(
+        full, width=12, height=9, fx=full.fx / 2, fy=full.fy / 2, cx=(full.cx + 0.5) / 2 - 0.5, cy=(full.cy + 0.5) / 2 - 0.5
+    )
+    assert any("4 pictures have 0.5 times the size" in text for text in scene.problems)
 
 
 def test_missing_and_unknown_folders(tmp_path: Path) -> None:

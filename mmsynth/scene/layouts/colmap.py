@@ -1,84 +1,207 @@
-"""COLMAP's text model: ``images.txt``, and ``cameras.txt`` beside it.
+"""COLMAP scenes: a sparse model (``colmap_model``) and the pictures beside or above it.
 
-Poses are world to camera in OpenCV axes; principal points have the top-left pixel's centre at 0.5.
+* Models are sought in ``sparse/0``, ``sparse``, ``dense/0/sparse``, ``dense/sparse``, ``colmap/sparse/0``, ``colmap/sparse``, ``colmap``
+  and the folder itself; of several that to which most pictures belong is taken.
+* Pictures are in ``images/`` at the model or in a folder above it, or in these folders themselves. A model made at another size than the
+  files has its cameras scaled where both sides have one ratio; a picture of any other size does not belong to the model.
+* Names with subfolders are sensors of a rig, where ``frames`` say so, or where the folders hold the same names and the rotation from one
+  to the other is the same at every name. Else all pictures are of one sensor, however many cameras it has.
+* Ids of views count the model's images (or instants) by name. The region of interest is that of the sparse points.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.scene.checks import floats, make_camera, rotation_of, text_lines
-from mmsynth.scene.scene import StatedPose
-from mmsynth.sensors.camera import COEFFICIENTS, Camera, Lens
+from mmsynth.scene.images import SUFFIXES, read_native
+from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.layouts.colmap_model import ModelImage, is_model, read_model, read_points
+from mmsynth.scene.layouts.pictures import Pictures, Resizes
+from mmsynth.scene.points import SparsePoints
+from mmsynth.scene.region import region_from_cameras, region_from_points
+from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality, make_split
+from mmsynth.sensors.camera import Camera
 
-_LINE = "id qw qx qy qz tx ty tz camera name"
-# what each parameter of a COLMAP camera model is, in file order
-_MODELS = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-}
+_PLACES = ("sparse/*", "sparse", "dense/*/sparse", "dense/sparse", "colmap/sparse/*", "colmap/sparse", "colmap", ".")
+_SAME_ROTATION = 3.0  # degrees, median: what reconstructions of a rig leave
 
 
-def read_images_txt(path: Path) -> list[StatedPose]:
-    """Poses of ``images.txt``, where every image takes two lines, ``id qw qx qy qz tx ty tz camera name`` and its 2-D points.
+def models_in(root: Path) -> list[Path]:
+    """Folders with a model, in the order in which they are preferred."""
+    return [folder for place in _PLACES for folder in (sorted(root.glob(place)) if place != "." else [root]) if is_model(folder)]
 
-    Raises:
-        InputError: a line that is not that, or a camera that ``cameras.txt`` does not have or that is not supported.
-    """
-    cameras = _cameras(path.with_name("cameras.txt"))
-    out: list[StatedPose] = []
-    points_expected = False
-    for where, tokens in text_lines(path):
-        # a points line holds triples and may be empty or, in some files, left out; an image line never has 3 n tokens
-        # unless the name has spaces, and then it comes where no points line is expected
-        if points_expected and len(tokens) % 3 == 0:
-            points_expected = False
+
+def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Path | None = None) -> Scene:
+    """Read the scene in a folder, as ``load_scene``."""
+    taken, problems = _best_model(root, images)
+    groups = _sensors_of(taken.listed)
+    sources = list(dict.fromkeys(source for source, _ in groups.values()))
+    first = {source: read_native(next(file for name, file in taken.files.items() if groups[name][0] == source)) for source in sources}
+    names = {source: _sensor_name(source, sources, first[source]) for source in sources}
+    wanted = wanted_modalities(names.values(), modalities, taken.folder)
+    if len(sources) > 1:
+        problems.append(f"the folders {', '.join(sources)} in the names of {taken.folder} are taken as sensors of a rig.")
+    order = sorted({view for _, view in groups.values()})
+    ids = {view: index for index, view in enumerate(order)}
+    sensors: dict[str, Sensor] = {}
+    frames: list[Frame] = []
+    for source in sources:
+        name = names[source]
+        if name not in wanted:
             continue
-        if not tokens:
-            continue
-        if len(tokens) < 10:
-            raise InputError(f"{where}: {len(tokens)} values, expected '{_LINE}'.")
-        values = floats(tokens[1:8], where, _LINE)
-        if not tokens[8].isdecimal() or len(tokens[8]) > 18:
-            raise InputError(f"{where}: camera {tokens[8]} is not a whole number, expected '{_LINE}'.")
-        camera_id = int(tokens[8])
-        if cameras is not None and camera_id not in cameras:
-            raise InputError(f"{where}: camera {camera_id} is not in {path.with_name('cameras.txt')}.")
-        camera_to_world = np.eye(4)
-        camera_to_world[:3, :3] = rotation_of(values[:4], where).T
-        camera_to_world[:3, 3] = -camera_to_world[:3, :3] @ values[4:7]
-        camera = None if cameras is None else cameras[camera_id]
-        out.append(StatedPose(camera, camera_to_world, Path(" ".join(tokens[9:])).stem))
-        points_expected = True
-    return out
+        sensors[name] = make_sensor(name, {}, str(taken.folder), first[source], raw=False)
+        own = [image for image in taken.images if groups[image.name][0] == source]
+        placed = [Frame(name, ids[groups[i.name][1]], taken.files[i.name], taken.cameras[i.name], i.camera_to_world, source) for i in own]
+        frames += sorted(placed, key=lambda frame: frame.view)
+    poses = [frame.camera_to_world for frame in frames]
+    seen = region_from_cameras([frame.camera for frame in frames], poses)
+    points = read_points(taken.folder)
+    region = seen if points is None else region_from_points(points.positions, seen, np.stack([pose[:3, 3] for pose in poses]))
+    split = make_split(frame.view for frame in frames)
+    alpha = any(image.ndim == 3 and image.shape[2] in (2, 4) for image in first.values())
+    return Scene(root, "COLMAP", sensors, tuple(frames), region, split, black_background=True if alpha else None, problems=tuple(problems))
 
 
-def _cameras(path: Path) -> dict[int, Camera] | None:
-    if not path.is_file():
-        return None
-    out: dict[int, Camera] = {}
-    for where, tokens in text_lines(path):
-        if not tokens:
-            continue
-        if len(tokens) < 4 or tokens[1] not in _MODELS:
-            models = " ".join(_MODELS)
-            raise InputError(f"{where}: unsupported camera, expected 'id model width height ...' with one of the models {models}.")
-        names = _MODELS[tokens[1]].split()
+def read_colmap_points(root: Path, images: Path | None = None) -> SparsePoints | None:
+    """The sparse points of the model that ``read_colmap`` takes."""
+    return read_points(_best_model(root, images)[0].folder)
+
+
+# --- the model that belongs to the pictures
+
+
+@dataclass(frozen=True)
+class _Fitting:
+    """A model, and the pictures that belong to it: files and cameras by name."""
+
+    folder: Path
+    listed: list[ModelImage]
+    files: dict[str, Path]
+    cameras: dict[str, Camera]
+    misfits: list[str]
+    resized: list[str]
+
+    @property
+    def images(self) -> list[ModelImage]:
+        return [image for image in self.listed if image.name in self.files]
+
+
+def _best_model(root: Path, images: Path | None) -> tuple[_Fitting, list[str]]:
+    """The model with the most pictures, and what there is to say of it and of the others."""
+    found: list[_Fitting] = []
+    refused: dict[Path, str] = {}
+    for folder in models_in(root):
         try:
-            identity, size = int(tokens[0]), (int(tokens[2]), int(tokens[3]))
-            value = dict(zip(names, map(float, tokens[4:]), strict=True))
-        except ValueError as error:
-            raise InputError(f"{where}: expected {len(names)} numbers ({' '.join(names)}) after the size.") from error
-        lens: Lens = "kannala_brandt" if tokens[1] == "OPENCV_FISHEYE" else "brown_conrady"
-        distortion = [value.get(key, 0.0) for key in COEFFICIENTS[lens]]
-        fx, fy = (value[key] if key in value else value["f"] for key in ("fx", "fy"))
-        out[identity] = make_camera(where, size, (fx, fy, value["cx"] - 0.5, value["cy"] - 0.5), distortion, lens)
-    return out
+            fitting = _fitting(folder, root, images)
+        except InputError as error:
+            refused[folder] = str(error)
+            continue
+        if fitting.files:
+            found.append(fitting)
+        else:
+            count = len(fitting.listed)
+            nowhere = f"{folder}: none of its {count} images has a file in {images or root}; --images FOLDER says where they are."
+            refused[folder] = fitting.misfits[0] if fitting.misfits else nowhere
+    if not found:
+        raise InputError(next(iter(refused.values())))
+    best = max(found, key=lambda fitting: (len(fitting.files), not fitting.resized))
+    problems = [f"{best.folder} is read, and not {folder}: {text}" for folder, text in refused.items()]
+    others = [f"{fitting.folder} ({len(fitting.files)})" for fitting in found if fitting is not best]
+    if others:
+        problems.append(f"{best.folder} is read, the model of {len(best.files)} pictures; there are others: {', '.join(others)}.")
+    missing = len(best.listed) - len(best.files) - len(best.misfits)
+    if missing:
+        problems.append(f"{missing} of {len(best.listed)} images of {best.folder} have no file and are left out.")
+    if best.misfits:
+        problems.append(f"{len(best.misfits)} pictures do not fit their cameras and are left out, the first: {best.misfits[0]}")
+    strangers = _not_in_model(best)
+    if strangers:
+        problems.append(f"{len(strangers)} pictures are not in {best.folder} and are left out, the first is {strangers[0].name}.")
+    return best, problems + best.resized
+
+
+def _fitting(folder: Path, root: Path, images: Path | None) -> _Fitting:
+    listed = read_model(folder)
+    files = _files(listed, folder, root, images)
+    resizes = Resizes(str(folder))
+    cameras: dict[str, Camera] = {}
+    misfits: list[str] = []
+    for image in listed:
+        if image.name not in files or image.camera is None:
+            continue
+        try:
+            cameras[image.name] = resizes.fitted(image.camera, files[image.name])
+        except InputError as error:
+            misfits.append(str(error))
+    kept = {name: files[name] for name in cameras}
+    return _Fitting(folder, listed, kept, cameras, misfits, resizes.problems())
+
+
+def _files(listed: Sequence[ModelImage], folder: Path, root: Path, images: Path | None) -> dict[str, Path]:
+    """The files of a model's images, by name, from the place that has most of them."""
+    if images is not None:
+        places = [Pictures(folder, images)]
+    else:
+        levels = [folder, *(parent for parent in folder.parents if parent.is_relative_to(root))]
+        places = [Pictures(place) for level in levels for place in (level / "images", level)]
+    best: dict[str, Path] = {}
+    for place in places:
+        there = {image.name: file for image in listed if (file := place.find(image.name)) is not None}
+        best = there if len(there) > len(best) else best
+    return best
+
+
+def _not_in_model(model: _Fitting) -> list[Path]:
+    """Pictures in the folders of the model's own, and of their type, that it does not have."""
+    known = set(model.files.values())
+    types = {file.suffix for file in known} & {suffix for file in known if (suffix := file.suffix).lower() in SUFFIXES}
+    beside = (file for folder in sorted({file.parent for file in known}) for file in sorted(folder.iterdir()))
+    misfits = {text.split(": ")[0] for text in model.misfits}
+    return [file for file in beside if file.suffix in types and file not in known and str(file) not in misfits]
+
+
+# --- sensors of a rig
+
+
+def _sensors_of(images: Sequence[ModelImage]) -> Mapping[str, tuple[str, str]]:
+    """Name of an image → its sensor, as the model spells it, and its view."""
+    folder = {image.name: str(PurePosixPath(image.name).parent) for image in images}
+    framed = [image for image in images if image.frame is not None]
+    if framed:
+        by_camera = {image.camera_id: folder[image.name] for image in framed}
+        named = len(set(by_camera.values())) == len(by_camera)
+        sensor = {image.name: folder[image.name] if named else f"camera{image.camera_id}" for image in framed}
+        return {image.name: (sensor[image.name], f"{image.frame:012d}") for image in framed}
+    folders = list(dict.fromkeys(folder.values()))
+    stems = {place: {PurePosixPath(i.name).stem: i for i in images if folder[i.name] == place} for place in folders}
+    if len(folders) > 1 and all(_on_one_rig(stems[folders[0]], stems[other]) for other in folders[1:]):
+        return {image.name: (folder[image.name], PurePosixPath(image.name).stem) for image in images}
+    return {image.name: (".", image.name) for image in images}
+
+
+def _on_one_rig(one: Mapping[str, ModelImage], other: Mapping[str, ModelImage]) -> bool:
+    """Whether the images of two folders that are called the same differ by one rotation, and are of different cameras."""
+    from scipy.spatial.transform import Rotation  # a second to import
+
+    shared = sorted(one.keys() & other.keys())
+    if len(shared) < 2 or {image.camera_id for image in one.values()} & {image.camera_id for image in other.values()}:
+        return False
+    between = [one[name].camera_to_world[:3, :3].T @ other[name].camera_to_world[:3, :3] for name in shared]
+    rotations = Rotation.from_matrix(np.stack(between))
+    apart = (rotations * rotations.mean().inv()).magnitude()
+    return float(np.degrees(np.median(apart))) < _SAME_ROTATION
+
+
+def _sensor_name(source: str, sources: Sequence[str], image: np.ndarray) -> str:
+    """By the last folder of its names where that is its own; of one sensor alone, by its channels."""
+    if len(sources) == 1 or source == ".":
+        return "mono" if image.ndim == 2 or image.shape[2] == 2 else "rgb"
+    last = Counter(canonical_modality(PurePosixPath(other).name) for other in sources)
+    short = canonical_modality(PurePosixPath(source).name)
+    return short if last[short] == 1 else source.replace("/", "_").lower()

@@ -13,37 +13,39 @@ from pathlib import Path
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.scene.checks import floats, is_file, make_camera, rigid_pose, text_lines
+from mmsynth.scene.checks import floats, make_camera, rigid_pose, text_lines
 from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.layouts.pictures import Pictures, Resizes
 from mmsynth.scene.region import region_from_cameras
 from mmsynth.scene.scene import Frame, Region, Scene, ball, make_split
 
 
-def read_middlebury(root: Path, modalities: Sequence[str] | None = None) -> Scene:
+def read_middlebury(root: Path, modalities: Sequence[str] | None = None, images: Path | None = None) -> Scene:
     """Read the scene in a folder, as ``load_scene``: one modality, rgb, or mono for grey images. What is listed and missing is left out."""
     files = sorted(root.glob("*_par.txt"))
     if len(files) != 1:
         raise InputError(f"{root}: {len(files)} files match *_par.txt, expected one.")
     path = files[0]
+    pictures, resizes = Pictures(root, images), Resizes(str(path))
     found: list[tuple[int, Path, list[float], np.ndarray]] = []
     missing = 0
     lines = [line for line in text_lines(path) if line[1]]
     lines = lines[1:] if lines and len(lines[0][1]) == 1 else lines  # the count of images
     for view, (where, tokens) in enumerate(lines):
         intrinsics, pose = _parse(tokens, where)
-        if is_file(root / tokens[0]):
-            found.append((view, root / tokens[0], intrinsics, pose))
+        file = pictures.find(tokens[0])
+        if file is not None:
+            found.append((view, file, intrinsics, pose))
         else:
             missing += 1
     if not found:
-        raise InputError(f"{path}: none of the {missing} images listed is in {root}.")
+        raise InputError(f"{path}: none of the {missing} images listed is in {images or root}.")
     first = read_native(found[0][1])
-    name = "mono" if first.ndim == 2 else "rgb"
+    name = "mono" if first.ndim == 2 or first.shape[2] == 2 else "rgb"
     wanted_modalities([name], modalities, path)
-    height, width = first.shape[:2]
     frames = tuple(
-        Frame(name, view, image, make_camera(f"{path}: view {view}", (width, height), intrinsics), pose, name)
+        Frame(name, view, image, make_camera(f"{path}: view {view}", resizes.size_of(image), intrinsics), pose, name)
         for view, image, intrinsics, pose in found
     )
     region = _stated_region(root) or region_from_cameras([f.camera for f in frames], [f.camera_to_world for f in frames])

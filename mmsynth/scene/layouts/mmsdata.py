@@ -59,9 +59,10 @@ _MODELS = {
 }
 
 
-def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
-    """Read the scene in a folder, as ``load_scene``. A modality without images is refused."""
+def read_mmsdata(root: Path, modalities: Sequence[str] | None = None, images: Path | None = None) -> Scene:
+    """Read the scene in a folder, as ``load_scene``. A modality without images is refused. ``images``: in place of ``modalities/``."""
     path = root / "meta_data.json"
+    folder = images or root / "modalities"
     meta = _read_meta(path)
     raw = _flag(meta, "raw", path)
     to_output, scale, unit = _world_to_output(meta, path)
@@ -81,9 +82,9 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None) -> Scene:
         where = f"{path}: modality '{source}'"
         entry = _modality(meta, source, where)
         camera = _camera(meta, entry, path, where)
-        present, missing = _frames(entry, where, root, source, name, camera, to_output, scale)
+        present, missing = _frames(entry, where, root, folder / source, source, name, camera, to_output, scale)
         if not present:
-            raise InputError(f"{where} has no image files in {root / 'modalities' / source}; leave it out to use the other modalities.")
+            raise InputError(f"{where} has no image files in {folder / source}; leave it out to use the other modalities.")
         if missing:
             problems.append(f"{name}: {missing} of {missing + len(present)} frames have no image file and are left out.")
         sensors[name] = make_sensor(name, entry, where, read_native(present[0].path), raw)
@@ -235,13 +236,21 @@ def _camera(meta: Mapping[str, Any], entry: Mapping[str, Any], path: Path, where
 
 
 def _frames(
-    entry: Mapping[str, Any], where: str, root: Path, source: str, name: str, camera: Camera, to_output: np.ndarray, scale: float
+    entry: Mapping[str, Any],
+    where: str,
+    root: Path,
+    folder: Path,
+    source: str,
+    name: str,
+    camera: Camera,
+    to_output: np.ndarray,
+    scale: float,
 ) -> tuple[list[Frame], int]:
     """Frames with an image file, by view, and the count of those without."""
     present: dict[int, Frame] = {}
     missing = 0
     for view, file_name, pose in _stated_frames(entry, where, to_output, scale):
-        path = root / "modalities" / source / file_name
+        path = folder / file_name
         if not is_file(path):
             missing += 1
             continue

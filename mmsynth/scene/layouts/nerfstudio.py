@@ -6,6 +6,7 @@
 * Test views: ``test_filenames`` (or all but ``train_filenames``), else ``test_ids``, else every tenth.
 * One file may hold several sensors: a frame's optional key ``modality`` (default rgb, or mono for one-channel images)
   says which, and the optional top-level object ``modalities`` describes them with the keys of ``known_sensors.make_sensor``.
+* Pictures of another size than ``w``, ``h``: the camera is scaled, where both sides have one ratio.
 * The region of interest is not in the file, unless its optional key ``region`` has it (``centre`` and ``radius``): see
   ``region.region_from_cameras``, and ``region_from_points`` for files with the sparse points of ``ply_file_path`` and for pictures with
   calibration boards. ``unit`` is optional, too.
@@ -25,8 +26,9 @@ from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.capture.boards import board_points
 from mmsynth.scene.checks import is_file, make_camera, number, numbers, objects, rigid_pose, view_ids, whole
-from mmsynth.scene.images import SUFFIXES, read_native
+from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
+from mmsynth.scene.layouts.pictures import Pictures, Resizes, without_suffix
 from mmsynth.scene.points import SparsePoints, read_ply_points
 from mmsynth.scene.region import region_from_cameras, region_from_points
 from mmsynth.scene.scene import (
@@ -51,21 +53,22 @@ _FISHEYE_MODEL = "OPENCV_FISHEYE"
 _MODEL_OF: dict[str, str] = {"brown_conrady": "OPENCV", "kannala_brandt": _FISHEYE_MODEL}
 
 
-def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scene:
+def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None, images: Path | None = None) -> Scene:
     """Read the scene in a folder with ``transforms.json``, or of the JSON file itself, as ``load_scene``."""
     path = path / "transforms.json" if path.is_dir() else path
     root = path.parent
+    pictures = Pictures(root, images)
     meta = read_json(path)
     if not isinstance(meta, dict):
         raise InputError(f"{path}: a JSON {type(meta).__name__}, expected an object with the key 'frames'.")
     listed = objects(meta, "frames", path)
-    found = {index: _image_path(root, frame, f"{path}: frame {index}") for index, frame in enumerate(listed)}
-    images = {index: image for index, image in found.items() if image is not None}
-    if not images:
-        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {root}.")
-    problems = _missing(listed, images)
+    found = {index: pictures.find(file_name(frame, f"{path}: frame {index}")) for index, frame in enumerate(listed)}
+    files = {index: file for index, file in found.items() if file is not None}
+    if not files:
+        raise InputError(f"{path}: none of the {len(listed)} frames has an image file in {images or root}.")
+    problems = _missing(listed, files)
     first: dict[str, np.ndarray] = {}  # by modality as the file spells it: the first image, for size and channels
-    for index, file in images.items():
+    for index, file in files.items():
         if _source(listed[index]) not in first:
             first[_source(listed[index])] = read_native(file)
     default = lambda image: "mono" if image.ndim == 2 or image.shape[2] == 2 else "rgb"
@@ -81,7 +84,7 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None) -> Scen
             entry = described.get(names[source], {})
             sensors[names[source]] = make_sensor(names[source], entry, str(path), image, raw="mosaick_pattern" in entry)
     sizes = {source: (image.shape[1], image.shape[0]) for source, image in first.items() if names[source] in sensors}
-    frames = _frames(meta, listed, images, names, sizes, path)
+    frames = _frames(meta, listed, files, names, sizes, path, problems)
     plain = {source: sensors[names[source]].channel_count for source in sizes if sensors[names[source]].mosaic is None}
     alpha = any(first[source].ndim == 3 and first[source].shape[2] > count for source, count in plain.items())
     region = _stated_region(meta, path) or _region(meta, root, sensors, frames, problems)
@@ -95,12 +98,12 @@ def _source(frame: Mapping[str, Any]) -> str:
     return str(frame.get("modality", ""))
 
 
-def _missing(listed: Sequence[Mapping[str, Any]], images: Mapping[int, Path]) -> list[str]:
+def _missing(listed: Sequence[Mapping[str, Any]], files: Mapping[int, Path]) -> list[str]:
     """A sentence about frames, and one about each modality, without images."""
     problems = []
-    if len(images) < len(listed):
-        problems.append(f"{len(listed) - len(images)} of {len(listed)} frames have no image file and are left out.")
-    there = {_source(listed[index]) for index in images}
+    if len(files) < len(listed):
+        problems.append(f"{len(listed) - len(files)} of {len(listed)} frames have no image file and are left out.")
+    there = {_source(listed[index]) for index in files}
     lost = [source or "the default modality" for source in dict.fromkeys(map(_source, listed)) if source not in there]
     return problems + [f"{name}: none of its frames has an image file, it is left out." for name in lost]
 
@@ -108,13 +111,15 @@ def _missing(listed: Sequence[Mapping[str, Any]], images: Mapping[int, Path]) ->
 def _frames(
     meta: Mapping[str, Any],
     listed: Sequence[Mapping[str, Any]],
-    images: Mapping[int, Path],
+    files: Mapping[int, Path],
     names: Mapping[str, str],
     sizes: Mapping[str, tuple[int, int]],
     path: Path,
+    problems: list[str],
 ) -> list[Frame]:
     """Frames with an image, of the modalities whose sizes are given, by sensor and view; every pose in the list is checked."""
     frames: list[Frame] = []
+    scaled = Resizes(str(path))
     count: Counter[str] = Counter()  # of frames of the same modality before, with an image or without
     for index, frame in enumerate(listed):
         source = _source(frame)
@@ -122,15 +127,17 @@ def _frames(
         position = count[source]
         count[source] += 1
         pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
-        if index not in images or source not in sizes:
+        if index not in files or source not in sizes:
             continue
-        camera = _camera(meta, frame, where, sizes[source])
+        camera = frame_camera(meta, frame, where, sizes[source])
         if camera is None:
             raise InputError(f"{where}: no focal length, expected 'fl_x' or 'camera_angle_x' in the frame or the file.")
+        camera = scaled.fitted(camera, files[index])
         view = whole(frame, "view", where, 0, MAX_VIEW) if "view" in frame else position
         mask = path.parent / str(frame["mask_path"]) if "mask_path" in frame else None
         mask = mask if mask is not None and is_file(mask) else None
-        frames.append(Frame(names[source], view, images[index], camera, pose, source, mask))
+        frames.append(Frame(names[source], view, files[index], camera, pose, source, mask))
+    problems += scaled.problems()
     order = list(dict.fromkeys(names[source] for source in sizes))
     frames.sort(key=lambda frame: (order.index(frame.sensor), frame.view))
     for one, two in itertools.pairwise(frames):
@@ -167,19 +174,16 @@ def _region(meta: Mapping[str, Any], root: Path, sensors: Mapping[str, Sensor], 
     return region_from_points(board_points(plain), region, stands) if plain else region
 
 
-def _image_path(root: Path, frame: Mapping[str, Any], where: str) -> Path | None:
-    """The frame's image; a ``file_path`` without a known extension is tried with each of them."""
+def file_name(frame: Mapping[str, Any], where: str) -> str:
+    """The name of a frame's picture as the file spells it."""
     if not isinstance(frame.get("file_path"), str):
         raise InputError(f"{where}: key 'file_path' is {frame.get('file_path', 'missing')!r}, expected the name of an image file.")
-    path = root / frame["file_path"]
-    # appended, not replaced: "0001.rgb" is a name without extension
-    candidates = [path] if path.suffix.lower() in SUFFIXES else [path.with_name(path.name + suffix) for suffix in SUFFIXES]
-    return next((candidate for candidate in candidates if is_file(candidate)), None)
+    return str(frame["file_path"])
 
 
 def _split(meta: Mapping[str, Any], frames: Sequence[Frame], path: Path) -> Split:
     views = [frame.view for frame in frames]
-    by_name = {str(_without_suffix(frame.path)): frame.view for frame in frames}
+    by_name = {str(without_suffix(frame.path)): frame.view for frame in frames}
     test, train = _names(meta, "test_filenames", path), _names(meta, "train_filenames", path)
     if test:
         return make_split(views, (view for name, view in by_name.items() if name in test), "test_filenames")
@@ -192,11 +196,7 @@ def _names(meta: Mapping[str, Any], key: str, path: Path) -> set[str]:
     given = meta.get(key, [])
     if not isinstance(given, list):
         raise InputError(f"{path}: key '{key}' is not a list of file names.")
-    return {str(_without_suffix(path.parent / str(name))) for name in given}
-
-
-def _without_suffix(path: Path) -> Path:
-    return path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
+    return {str(without_suffix(path.parent / str(name))) for name in given}
 
 
 def read_transforms(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
@@ -211,7 +211,7 @@ def read_transforms(content: Mapping[str, Any], path: Path) -> list[StatedPose]:
             height, width = read_native(image).shape[:2]
             size = width, height
         pose = rigid_pose(frame.get("transform_matrix"), where) @ OPENGL_TO_OPENCV
-        out.append(StatedPose(_camera(content, frame, where, size), pose, Path(name).stem))
+        out.append(StatedPose(frame_camera(content, frame, where, size), pose, Path(name).stem))
     return out
 
 
@@ -239,7 +239,7 @@ def read_camera_path(content: Mapping[str, Any], path: Path) -> list[StatedPose]
     return out
 
 
-def _camera(shared: Mapping[str, Any], frame: Mapping[str, Any], where: str, size: tuple[int, int] | None = None) -> Camera | None:
+def frame_camera(shared: Mapping[str, Any], frame: Mapping[str, Any], where: str, size: tuple[int, int] | None = None) -> Camera | None:
     """Intrinsics of one frame of transforms.json; a key of the frame wins over the shared one.
 
     Distortion k1..k6, p1, p2 is read as OpenCV's rational Brown model, k1..k4 of an ``OPENCV_FISHEYE`` (or ``is_fisheye``) as
