@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any, TypeVar
 
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.scene.encoding import encoding_of
 from mmsynth.scene.images import check_file, load_frame, read_native, used_bits
 from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, Scene, Sensor
@@ -16,6 +18,7 @@ from mmsynth.scene.serialisation import sensor_to_json
 from mmsynth.sensors.camera import Camera, round_trip_error
 
 T = TypeVar("T")
+_ENCODING_FRAMES = 4
 
 
 def describe_scene(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
@@ -47,8 +50,8 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
     """frames (and how many train, test, have a mask; foreground_percent: of the masks' pixels), size [width, height] of the first frame,
     channels, wavelengths_nm, mosaic, polarizer_angles_deg, file_type, bits in use and saturation (None: float data, never), pixel
     statistics mean, min, max, saturated_percent over frames_measured, and the lens of the first frame: its model, invalid_lens_pixels,
-    photosites without a ray, and round_trip_px, how far from its pixel a ray in float32 comes back at the most (of every n-th row and
-    column where the frame has more than 250 000 pixels)."""
+    photosites without a ray, round_trip_px, how far from its pixel a ray in float32 comes back at the most (of every n-th row and
+    column where the frame has more than 250 000 pixels), and encoding: how values stand to light, and why (``encoding.encoding_of``)."""
     frames = scene.frames_of(sensor.name)
     camera = frames[0].camera
     out: dict[str, Any] = {
@@ -75,6 +78,8 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
     masked = [frame for frame in frames if frame.mask is not None]
     if masked:
         out["foreground_percent"] = _foreground_percent(sensor, masked, measured_frames, problems)
+    encoding = _tried(problems, encoding_of, sensor, [frames[index].path for index in _spread(len(frames), _ENCODING_FRAMES)])
+    out["encoding"] = None if encoding is None else asdict(encoding)
     if out["file_type"] == "uint16" and out["max"] is not None and out["max"] <= 4095 / 65535:
         problems.append(f"{sensor.name}: no value exceeds {out['max']:.3f} of full scale, as in 12-bit data that is not left-aligned.")
     return out
@@ -182,6 +187,8 @@ def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
             f"  values    {sensor['min']:.4f} to {sensor['max']:.4f}, mean {sensor['mean']:.4f}, "
             f"{sensor['saturated_percent']:.2f} % saturated (in {sensor['frames_measured']} frames)"
         )
+    if sensor["encoding"] is not None:
+        lines.append(f"  encoding  {sensor['encoding']['verdict']}: {sensor['encoding']['because']}")
     back = (
         "no pixel has a ray"
         if sensor["round_trip_px"] is None
