@@ -88,19 +88,8 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None, images:
     alpha = any(first[source].ndim == 3 and first[source].shape[2] > count for source, count in plain.items())
     region = stated_region(meta, path) or _region(meta, root, sensors, frames, problems)
     split = _split(meta, frames, path)
-    transparent = True if alpha else None
-    return Scene(
-        root,
-        "nerfstudio",
-        sensors,
-        tuple(frames),
-        region,
-        split,
-        str(meta.get("unit", "input unit")),
-        transparent,
-        "ignore",
-        tuple(problems),
-    )
+    unit, black = str(meta.get("unit", "input unit")), True if alpha else None
+    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, unit, black, "ignore", problems=tuple(problems))
 
 
 def _source(frame: Mapping[str, Any]) -> str:
