@@ -23,8 +23,9 @@ from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_mmsdata_points, rea
 from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_nerfstudio_points, read_transforms
 from mmsynth.scene.layouts.neus import cameras_of, read_neus
 from mmsynth.scene.layouts.tum import is_tum, read_tum
+from mmsynth.scene.masks import use_masks
 from mmsynth.scene.points import SparsePoints
-from mmsynth.scene.scene import Frame, Layout, Region, Scene, SceneSource, StatedPose
+from mmsynth.scene.scene import Frame, Layout, MaskMeaning, Region, Scene, SceneSource, StatedPose
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 
 _ROUND_TRIP = 1e-3  # pixels
@@ -82,10 +83,22 @@ def load_scene(
     return dataclasses.replace(_checked(scene, source.path), source=source)
 
 
-def load_again(stated: Mapping[str, Any], *, modalities: Sequence[str] | None = None) -> Scene:
-    """Read the scene of a run again: ``stated`` is what its manifest says of the scene (``serialisation.source_to_json``)."""
+def load_again(
+    stated: Mapping[str, Any],
+    *,
+    modalities: Sequence[str] | None = None,
+    masks: MaskMeaning | None = None,
+    mask_folder: Path | None = None,
+) -> Scene:
+    """Read the scene of a run again: ``stated`` is what its manifest says of the scene (``serialisation.source_to_json``).
+
+    Args:
+        masks, mask_folder: see ``use_masks``; None: as the manifest has them.
+    """
     how = {key: stated.get(key) for key in ("images", "also")}
-    return load_scene(stated["path"], modalities=modalities, layout=stated.get("format"), **how)
+    scene = load_scene(stated["path"], modalities=modalities, layout=stated.get("format"), **how)
+    of_fit = stated.get("mask_folder")
+    return use_masks(scene, masks or stated.get("masks"), mask_folder or (Path(of_fit) if of_fit else None))
 
 
 def _checked(scene: Scene, path: Path) -> Scene:

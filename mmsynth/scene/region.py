@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from mmsynth.errors import InputError
+from mmsynth.scene.checks import number, numbers
 from mmsynth.scene.scene import Region, ball
 from mmsynth.sensors.camera import Camera, project
 
@@ -126,3 +130,18 @@ def region_from_silhouettes(
     middle = (full.min(0) + full.max(0)) / 2
     radius = float(np.linalg.norm(full - middle, axis=1).max()) + step
     return ball(middle, radius) if radius < seen.radius else seen
+
+
+def stated_region(meta: Mapping[str, Any], path: Path) -> Region | None:
+    """``meta["region"]`` of a file: ``centre`` and ``radius``; None where it has none. Raises InputError: no such ball."""
+    if "region" not in meta:
+        return None
+    where, entry = f"{path}: key 'region'", meta["region"]
+    complaint = f"{where} is {entry!r}, expected an object with 'centre', three numbers, and 'radius'."
+    centre = numbers(entry.get("centre") if isinstance(entry, dict) else None, complaint)
+    if centre.shape != (3,) or not np.isfinite(centre).all():
+        raise InputError(complaint)
+    radius = number(entry, "radius", where, low=0.0)
+    if radius == 0:
+        raise InputError(f"{where}: radius 0, expected a positive number.")
+    return ball(centre, radius)
