@@ -143,7 +143,9 @@ def identity(job: Job, scene: str) -> dict[str, Any]:
 
 def scene_hash(scene: Scene) -> str:
     """Of the frames, their poses, cameras and masks, the sensors, the region, the split and the ground truth."""
-    digest = hashlib.sha256(repr((scene.region, scene.split, scene.unit, scene.black_background, list(scene.sensors.values()))).encode())
+    digest = hashlib.sha256(
+        repr((scene.region, scene.split, scene.unit, scene.black_background, scene.masks, list(scene.sensors.values()))).encode()
+    )
     for frame in scene.frames:
         digest.update(repr((frame.sensor, frame.view, frame.camera)).encode())
         digest.update(np.ascontiguousarray(frame.camera_to_world).tobytes())

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from mmsynth.errors import InputError
+
+if TYPE_CHECKING:
+    from mmsynth.scene.scene import MaskMeaning
 
 RunOption = Annotated[Path | None, typer.Option("--run", help="run folder; default: the last fit made in this folder")]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda")]
@@ -29,6 +32,16 @@ AlsoOption = Annotated[
 ]
 FramesOption = Annotated[
     str | None, typer.Option(help="number of training frames to keep of some modalities, e.g. pol=3,ms=5; default: all")
+]
+
+MasksOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--masks",
+        metavar="object|ignore|off|FOLDER",
+        help="what masks mean: nothing is outside, do not learn from what is outside, or they only score; "
+        "or a folder of masks, such as MMS-DATA's archive; may be given twice, once for each",
+    ),
 ]
 
 
@@ -104,6 +117,17 @@ def seconds_of(text: str, option: str = "--budget") -> float:
     if not match or float(match[1]) <= 0:
         raise InputError(f"{option} {text!r}: expected a time such as 60s, 5m or 1h.")
     return float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2] or "s"]
+
+
+def masks_of(texts: list[str] | None) -> tuple[MaskMeaning | None, Path | None]:
+    """What masks mean, and the folder that they lie in."""
+    meanings = [text for text in texts or () if text in ("object", "ignore", "off")]
+    folders = [Path(text) for text in texts or () if text not in ("object", "ignore", "off")]
+    if len(meanings) > 1 or len(folders) > 1:
+        raise InputError(f"--masks {' --masks '.join(texts or ())}: expected one of object, ignore, off, and one folder.")
+    if folders and not folders[0].is_dir():
+        raise InputError(f"--masks {folders[0]}: no such folder, expected one of masks, or object, ignore or off.")
+    return (cast("MaskMeaning", meanings[0]) if meanings else None), (folders[0] if folders else None)
 
 
 def fit_length(steps: int | None, budget: str | None, default: str | None = None) -> float | None:

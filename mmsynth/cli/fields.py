@@ -15,12 +15,14 @@ from mmsynth.cli.arguments import (
     ImagesOption,
     JsonOption,
     LayoutOption,
+    MasksOption,
     ModalitiesOption,
     RecipeOption,
     RunOption,
     SceneArgument,
     fit_length,
     frame_limits,
+    masks_of,
     modality_names,
     modality_pairs,
     scene_path,
@@ -40,13 +42,16 @@ def info(
     layout: LayoutOption = None,
     images: ImagesOption = None,
     also: AlsoOption = None,
+    masks: MasksOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
     from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
 
-    description = describe_scene(load_scene(scene_path(scene), layout=layout, images=images, also=sensor_folders(also)))
+    meaning, folder = masks_of(masks)
+    read = load_scene(scene_path(scene), layout=layout, images=images, also=sensor_folders(also), masks=meaning, mask_folder=folder)
+    description = describe_scene(read)
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -60,6 +65,7 @@ def fit(
     layout: LayoutOption = None,
     images: ImagesOption = None,
     also: AlsoOption = None,
+    masks: MasksOption = None,
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
@@ -78,7 +84,11 @@ def fit(
     from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    read = load_scene(scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also))
+    meaning, folder = masks_of(masks)
+    read = load_scene(
+        scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also),
+        masks=meaning, mask_folder=folder,
+    )  # fmt: skip
     loaded = keep_frames(read, frame_limits(frames))
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
@@ -107,6 +117,7 @@ def fit(
 @command("evaluate")
 def evaluate(
     run: RunOption = None,
+    masks: MasksOption = None,
     convert: Annotated[
         str | None, typer.Option(help="score conversions instead, e.g. rgb:ms or rgb:ms,mono:pol; all: every pair", metavar="FROM:TO")
     ] = None,
@@ -118,7 +129,8 @@ def evaluate(
     from mmsynth.workflows.fit import evaluate_run
     from mmsynth.workflows.runs import open_run
 
-    opened = open_run(run)
+    meaning, folder = masks_of(masks)
+    opened = open_run(run, masks=meaning, mask_folder=folder)
     with progress_bar("evaluate", as_json) as show:
         if convert is None:
             scores = evaluate_run(opened, progress=show)

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
+from mmsynth.fitting.pixels import Pixels
 from mmsynth.scene.images import load_frame
-from mmsynth.scene.scene import Frame, Region, Scene, Sensor
+from mmsynth.scene.masks import read_mask
+from mmsynth.scene.scene import Frame, MaskMeaning, Region, Scene, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.mosaic import channel_map
 from mmsynth.sensors.polarization import analyser_axes
@@ -49,9 +51,12 @@ class Measurements:
 
     Attributes:
         radiance_scale: the mean of its values, by which residuals are compared with those of other modalities.
+        pixels: those whose numbers are learned from: with a ray, and within the mask where masks are ``object`` or ``ignore``.
+        empty: those with a ray outside an object's mask: nothing is there. None where no frame says so.
+        masked: frames with a mask that is learned from.
     """
 
-    def __init__(self, sensor: Sensor, frames: tuple[Frame, ...], region: Region) -> None:
+    def __init__(self, sensor: Sensor, frames: tuple[Frame, ...], region: Region, masks: MaskMeaning = "off") -> None:
         self.sensor = sensor
         self.cameras: list[Camera] = list(dict.fromkeys(f.camera for f in frames))
         values, alphas = [], []
@@ -61,28 +66,31 @@ class Measurements:
             alphas.append(alpha)
         self.starts = _begins([len(v) for v in values])
         self.values = _joined(values)
-        self.has_alpha = any(a is not None for a in alphas)
+        has_alpha = any(a is not None for a in alphas)
         # a frame without alpha beside frames with one is opaque
         opaque = [np.ones(len(v), np.float32) if a is None else a.reshape(-1) for v, a in zip(values, alphas, strict=True)]
-        self.alphas = _joined([_compact(a) for a in opaque]) if self.has_alpha else None
+        self.alphas = _joined([_compact(a) for a in opaque]) if has_alpha else None
         self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
         poses = np.stack([f.camera_to_world for f in frames])
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
         self.set_poses(poses)
         directions, valid = zip(*(ray_map(camera) for camera in self.cameras), strict=True)
-        usable = [np.flatnonzero(v) for v in valid]
-        if not all(map(len, usable)):
+        if not all(v.any() for v in valid):
             raise InputError(f"{sensor.name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
         # one camera after the other; of each frame, where its camera begins
         self.directions = np.concatenate([d.reshape(-1, 3).astype(np.float32) for d in directions])
         channels = [channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras if sensor.mosaic is not None]
         self.channels = np.concatenate(channels) if channels else None
-        self.usable = None if all(v.all() for v in valid) else np.concatenate(usable)
         self.first = _begins([v.size for v in valid])[self.camera_index]
-        self.first_usable = _begins([len(u) for u in usable])[self.camera_index]
-        self.counts = np.array([len(u) for u in usable])[self.camera_index]
-        self.ends = np.cumsum(self.counts)
-        drawn, pixel = self.pick(min(int(self.ends[-1]), 1 << 18), np.random.default_rng(0))
+        self.masked = 0 if masks == "off" else sum(frame.mask is not None for frame in frames)
+        of_frames = [valid[index].reshape(-1) for index in self.camera_index]
+        self.pixels, self.empty = _inside(frames, of_frames, masks) if self.masked else (Pixels(of_frames), None)
+        if not self.pixels.size:
+            raise InputError(
+                f"{frames[0].mask}: this mask of {sensor.name} and those of all its other training frames are empty, "
+                "expected pixels that are not zero."
+            )
+        drawn, pixel = self.pick(min(self.pixels.size, 1 << 18), np.random.default_rng(0))
         self.radiance_scale = float(self.read(drawn, pixel)[0].mean())
 
     def set_poses(self, poses: np.ndarray) -> None:
@@ -90,12 +98,14 @@ class Measurements:
         self.rotations = poses[:, :3, :3].astype(np.float32)
         self.origins = poses[:, :3, 3].astype(np.float32)
 
+    @property
+    def has_opacity(self) -> bool:
+        """Whether frames say where something is and where nothing: by alpha, or by masks of an object."""
+        return self.alphas is not None or self.empty is not None
+
     def pick(self, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """``count`` pixels, uniform over all frames with replacement: frame and pixel indices, (count,) each."""
-        drawn = random.integers(0, self.ends[-1], count)
-        frame = np.searchsorted(self.ends, drawn, side="right")
-        pixel = drawn - (self.ends[frame] - self.counts[frame])
-        return frame, pixel if self.usable is None else self.usable[self.first_usable[frame] + pixel]
+        return self.pixels.at(random.integers(0, self.pixels.size, count))
 
     def rays(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions, (N, 3) float32 each, normalised frame."""
@@ -163,7 +173,7 @@ def draw(
             "ray": np.repeat(np.arange(r_end, r_end + count), values),
             "output": output,
             "frame": np.repeat(frame + frames, values),
-            "alpha": np.full(count, np.nan, np.float32) if alpha is None else alpha,
+            "alpha": np.full(count, np.nan if m.empty is None else 1.0, np.float32) if alpha is None else alpha,
             **{key: np.full(target.size, value, np.float32) for key, value in of_all.items()},
         }
         for key, value in drawn.items():
@@ -175,23 +185,55 @@ def draw(
     return Batch(**joined, measured=measured, parts=parts)
 
 
+def draw_empty(
+    measurements: dict[str, Measurements], rays: dict[str, int], random: np.random.Generator, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Random rays along which nothing is, as masks of an object say: origins and directions, (R, 3) each.
+
+    Args:
+        rays: how many of each modality; those without such masks give none.
+    """
+    found = [m.rays(*m.empty.at(random.integers(0, m.empty.size, rays[n]))) for n, m in measurements.items() if m.empty is not None]
+    origins, directions = (torch.from_numpy(np.concatenate(part)).to(device) for part in zip(*found, strict=True))
+    return origins, directions
+
+
 def load_measurements(scene: Scene) -> dict[str, Measurements]:
     """Training pixels per modality.
 
     Raises:
-        InputError: an image is missing, broken or of the wrong size; a modality has no light in any training frame.
+        InputError: an image or a mask is missing, broken or of the wrong size; a modality has no light in any training frame, or its
+            masks are all empty.
     """
     out = {}
     for name, sensor in scene.sensors.items():
         frames = scene.frames_of(name, scene.split.train)
         if not frames:
             continue
-        out[name] = Measurements(sensor, frames, scene.region)
+        out[name] = Measurements(sensor, frames, scene.region, scene.masks)
         if not out[name].radiance_scale > 0:
             raise InputError(f"{frames[0].path.parent}: all training frames of {name} are black, expected some light.")
     if not out:
         raise InputError(f"{scene.root}: no modality has a training frame.")
     return out
+
+
+def _inside(frames: tuple[Frame, ...], valid: list[np.ndarray], masks: MaskMeaning) -> tuple[Pixels, Pixels | None]:
+    """``pixels`` and ``empty`` of ``Measurements``; ``valid``: (P,) of each frame.
+
+    A frame without a mask beside frames with one: to ignore nothing is to learn from all of it; but what in it is not the object,
+    nobody knows, and nothing is learned from it.
+    """
+    inside, outside = [], []
+    for frame, usable in zip(frames, valid, strict=True):
+        mask = read_mask(frame)
+        if mask is None:
+            mask = np.full(usable.shape, masks == "ignore")
+            usable = usable & mask
+        inside.append(usable & mask.reshape(-1))
+        outside.append(usable & ~mask.reshape(-1))
+    empty = Pixels(outside) if masks == "object" else None
+    return Pixels(inside), empty if empty is not None and empty.size else None
 
 
 def _begins(counts: list[int]) -> np.ndarray:

@@ -17,7 +17,7 @@ from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import MaskMeaning, Scene
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
 _OUTERMOST = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
@@ -26,6 +26,7 @@ _PAST = 0.005  # share of the pixels that see past the region, below which nothi
 _RAYS_PER_SECOND = 70_000  # of a fit, about: a constant, so that the design does not depend on the clock
 _SAMPLES_PER_RAY = 10  # of a fit, about
 _BY_RECIPE = "asked for by the recipe"
+_NOTHING = "the input says that it is black, transparent or outside the object's masks"
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,9 @@ class Needs:
     Attributes:
         footprint: the finest detail to expect at the region's centre, in radii. sharpness_end: of the surface [1/region radius].
         black_background: whether black pixels say that nothing is there.
-        sparse: modalities with so few pixels that they would spoil what others know better: they learn their colours from the
-            geometry and appearance of the others. share: of the rays that each modality gets, relative to a plentiful one.
+        sparse: modalities that learn their colours from the geometry and appearance of the others: with so few pixels that they would
+            spoil what others know better, or without the masks of the object that others have.
+        share: of the rays that each modality gets, relative to a plentiful one.
         choices: by name; what is decided later is in ``Trainer.choices``.
     """
 
@@ -81,7 +83,13 @@ class _Facts:
 
     @property
     def transparent(self) -> bool:
-        return self.scene.black_background or any(m.has_alpha for m in self.measurements.values())
+        return self.scene.black_background or any(m.has_opacity for m in self.measurements.values())
+
+    @property
+    def unmasked(self) -> list[str]:
+        """Modalities without masks of the object that others have: what is behind it is in their pixels."""
+        asked = self.scene.masks == "object" and any(m.masked for m in self.measurements.values())
+        return [n for n, m in self.measurements.items() if asked and not m.masked]
 
 
 def expected_rays(recipe: Recipe, steps: int | None, budget: float | None) -> float:
@@ -95,7 +103,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     Args:
         rays_to_come: about how many rays the fit will see (``expected_rays``).
     """
-    pixels = sum(int(m.ends[-1]) for m in measurements.values())
+    pixels = sum(m.pixels.size for m in measurements.values())
     seen = _look_outside(measurements, np.random.default_rng((seed, 7)))
     facts = _Facts(scene, measurements, recipe, rays_to_come, pixels, _footprint(measurements), *seen)
     background = _background(facts)
@@ -105,6 +113,7 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
     share = _ray_shares(facts)
     rows = _table_rows(facts)
     choices: dict[str, Choice[Any]] = {
+        "masks": _masks(facts),
         "background": background,
         "far_light": far_light,
         "resolution": resolution,
@@ -136,10 +145,30 @@ def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, 
         footprint=footprint,
         sharpness_end=max(sharpness, 2 * recipe.schedule.sharpness_start),
         black_background=not background.value and facts.outside >= _PAST,
-        sparse=tuple(n for n, s in share.value.items() if s < 1.0),
+        sparse=tuple(n for n, s in share.value.items() if s < 1.0 or n in facts.unmasked),
         share=share.value,
         choices=choices,
     )
+
+
+def _masks(f: _Facts) -> Choice[MaskMeaning]:
+    """What do the training frames' masks say about the pixels outside?"""
+    masked = {n: m for n, m in f.measurements.items() if m.masked}
+    if not masked:
+        frames = [frame for frame in f.scene.frames if frame.sensor in f.measurements and frame.view in f.scene.split.train]
+        having = sum(frame.mask is not None for frame in frames)
+        return Choice("off", f"off: {having} of {len(frames)} training frames have one" + (", they only score" if having else ""), False)
+    meaning = f.scene.masks
+    share = ", ".join(f"{n} {m.pixels.size / len(m.values):.1%}" for n, m in masked.items())
+    says = {"object": "nothing is outside", "ignore": "what is outside is not learned from"}[meaning]
+    why = f"{meaning}: {says}; inside are {share} of the pixels"
+    if meaning == "object":
+        lost = {n: len(m.origins) - m.masked for n, m in masked.items() if m.masked < len(m.origins)}
+        if lost:
+            why += f"; {', '.join(f'{count} frames of {n}' for n, count in lost.items())} have no mask and are not learned from"
+        if f.unmasked:
+            why += f"; {', '.join(f.unmasked)} without masks: learned from the geometry of the others"
+    return Choice(meaning, why, True)
 
 
 def _background(f: _Facts) -> Choice[bool]:
@@ -148,7 +177,7 @@ def _background(f: _Facts) -> Choice[bool]:
     if asked != "auto":
         return switch(asked == "on", _BY_RECIPE)
     if f.transparent:
-        return switch(False, "the input says that it is black or transparent")
+        return switch(False, _NOTHING)
     past = f"{f.outside:.1%} of {f.sampled} sampled pixels see past the region of interest"
     if f.outside < _PAST:
         return switch(False, past)
@@ -167,7 +196,7 @@ def _far_light(f: _Facts, background: bool) -> Choice[bool]:
     if asked != "auto":
         return switch(asked == "on", _BY_RECIPE)
     if f.transparent:
-        return switch(False, "the input says that it is black or transparent")
+        return switch(False, _NOTHING)
     if f.outside < _PAST:
         return switch(False, "nothing is seen past the region of interest")
     return switch(f.light > 0.01, f"what is past it has {f.light:.1%} of the brightest light")
@@ -206,8 +235,8 @@ def _initial_spheres(f: _Facts, background: bool) -> Choice[tuple[float, float]]
 
 def _ray_shares(f: _Facts) -> Choice[dict[str, float]]:
     """Of the rays that each modality gets: 1 where it has enough of the most plentiful one's pixels, else in proportion to its own."""
-    pixels = {n: int(m.ends[-1]) for n, m in f.measurements.items()}
-    enough = f.recipe.sampling.sparse_below * max(pixels.values())
+    pixels = {n: m.pixels.size for n, m in f.measurements.items()}
+    enough = f.recipe.sampling.sparse_below * max(count for n, count in pixels.items() if n not in f.unmasked)
     share = {n: min(1.0, count / enough) if enough else 1.0 for n, count in pixels.items()}
     sparse = ", ".join(f"{n} {len(f.measurements[n].origins)} frames" for n, s in share.items() if s < 1.0)
     why = f"on: {sparse}: learned from the geometry of the others" if sparse else "off: all modalities have enough pixels"

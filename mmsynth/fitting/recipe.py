@@ -138,7 +138,9 @@ class LossRecipe(_Section):
     eikonal_weight: float = _key(0.1, "Weight of (|∇sdf| - 1)², the pull towards a true distance [1].", ge=0)
     eikonal_points: int = _key(1024, "Points of a step that are asked for it [points].", ge=8)
     background_opacity_weight: float = _key(1.0, "Weight of opacity on black pixels of a scene whose background is black [1].", ge=0)
-    alpha_weight: float = _key(0.5, "Weight of the squared difference of opacity and alpha, where images have it [1].", ge=0)
+    alpha_weight: float = _key(
+        0.5, "Weight of the squared difference of opacity and alpha, where images have it or masks of an object say it [1].", ge=0
+    )
 
 
 class Recipe(_Section):

@@ -19,7 +19,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import losses
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
-from mmsynth.fitting.measurements import Batch, Measurements, draw, in_order, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, in_order, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
@@ -96,7 +96,8 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.has_alpha = any(m.has_alpha for m in self.measurements.values())
+        self.has_opacity = any(m.has_opacity for m in self.measurements.values())
+        self.has_empty = any(m.empty is not None for m in self.measurements.values())
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -131,6 +132,9 @@ class Trainer:
         self._prepare(sampling, generator)
         batch = self._draw(random)
         loss, errors, samples = self._loss(batch, sampling, generator)
+        if self.has_empty:
+            opacity, more = self._opacity_outside(random, sampling, generator)
+            loss, samples = loss + self.recipe.loss.alpha_weight * opacity.square().mean(), samples + more
         wrong = self._differentiate(loss)
         if wrong is not None:
             self._skip(wrong)
@@ -170,9 +174,23 @@ class Trainer:
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
 
     def _draw(self, random: np.random.Generator) -> Batch:
+        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.device)
+
+    def _rays(self) -> dict[str, int]:
+        """Of a step, how many of each modality."""
         total = sum(self.needs.share.values())
-        rays = {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
-        return draw(self.measurements, self.field.shader.columns, rays, random, self.device)
+        return {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
+
+    def _opacity_outside(
+        self, random: np.random.Generator, sampling: kernels.Sampling, generator: torch.Generator
+    ) -> tuple[torch.Tensor, int]:
+        """Opacity of as many rays outside the object's masks, (R,), which should be 0, and the samples that it took. Their colours are
+        those of a background that is not the object's, or of a picture that was painted white there: they are not looked at."""
+        origins, directions = draw_empty(self.measurements, self._rays(), random, self.device)
+        jitter = torch.rand(len(origins), generator=generator).to(self.device)
+        field = self.field
+        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
+        return hits.opacity, int(hits.samples)
 
     def _differentiate(self, loss: torch.Tensor) -> str | None:
         """Gradients of the loss; what is wrong where it or they are not finite, and then no gradient is left."""
@@ -207,7 +225,7 @@ class Trainer:
         shaded = field.with_far_light(hits) if self.state.decided is not None else (hits.features, hits.opacity)
         loss, squared = losses.compare(field.shader, *shaded, batch, degrees, trains_geometry, gain)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
-        if self.has_alpha:
+        if self.has_opacity:
             known = torch.isfinite(batch.alpha)
             loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(jitter)
         elif self.needs.black_background:
@@ -312,6 +330,8 @@ class Trainer:
             digest.update(name.encode())
             for part in (m.origins, m.rotations, m.values):
                 digest.update(np.ascontiguousarray(part).tobytes())
+            for chosen in (m.pixels, m.empty) if m.masked else ():
+                digest.update(b"" if chosen is None or chosen.bits is None else chosen.bits.tobytes())
         return {
             "scene": digest.hexdigest()[:16],
             "recipe": json.dumps(self.recipe.model_dump(), sort_keys=True),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -12,6 +12,7 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.scene.encoding import encoding_of
 from mmsynth.scene.images import check_file, load_frame, read_native, used_bits
+from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, Scene, Sensor
 from mmsynth.scene.serialisation import sensor_to_json
 from mmsynth.sensors.camera import Camera, round_trip_error
@@ -27,7 +28,7 @@ def describe_scene(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
     spread over its views. Damaged images are listed under ``problems`` and do not raise.
 
     Returns:
-        scene, format, unit, black_background, region {centre, radius}, split {train, test, source}, problems, and
+        scene, format, unit, black_background, masks (what they mean), region {centre, radius}, split {train, test, source}, problems, and
         sensors: by name the dictionary of ``_describe_sensor``.
     """
     problems = list(scene.problems)
@@ -37,6 +38,7 @@ def describe_scene(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
         "format": scene.format,
         "unit": scene.unit,
         "black_background": scene.black_background,
+        "masks": scene.masks,
         "region": {"centre": [float(value) for value in scene.region.centre], "radius": float(scene.region.radius)},
         "split": {"train": list(scene.split.train), "test": list(scene.split.test), "source": scene.split.source},
         "sensors": sensors,
@@ -45,11 +47,11 @@ def describe_scene(scene: Scene, measured_frames: int = 10) -> dict[str, Any]:
 
 
 def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problems: list[str]) -> dict[str, Any]:
-    """frames (and how many train, test, have a mask), size [width, height] of the first frame, channels, wavelengths_nm, mosaic,
-    polarizer_angles_deg, file_type, bits in use and saturation (None: float data, never), pixel statistics mean, min, max,
-    saturated_percent over frames_measured, and the lens of the first frame: its model, invalid_lens_pixels, photosites without a ray,
-    round_trip_px, how far from its pixel a ray in float32 comes back at the most (of every n-th row and column where the frame has
-    more than 250 000 pixels), and encoding: how values stand to light, and why (``encoding.encoding_of``)."""
+    """frames (and how many train, test, have a mask; foreground_percent: of the masks' pixels), size [width, height] of the first frame,
+    channels, wavelengths_nm, mosaic, polarizer_angles_deg, file_type, bits in use and saturation (None: float data, never), pixel
+    statistics mean, min, max, saturated_percent over frames_measured, and the lens of the first frame: its model, invalid_lens_pixels,
+    photosites without a ray, round_trip_px, how far from its pixel a ray in float32 comes back at the most (of every n-th row and
+    column where the frame has more than 250 000 pixels), and encoding: how values stand to light, and why (``encoding.encoding_of``)."""
     frames = scene.frames_of(sensor.name)
     camera = frames[0].camera
     out: dict[str, Any] = {
@@ -57,6 +59,7 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
         "train": sum(frame.view in scene.split.train for frame in frames),
         "test": sum(frame.view in scene.split.test for frame in frames),
         "masks": sum(frame.mask is not None for frame in frames),
+        "foreground_percent": None,
         "size": [camera.width, camera.height],
         "cameras": len({frame.camera for frame in frames}),
         **{key: value for key, value in sensor_to_json(sensor).items() if key != "name"},
@@ -72,8 +75,10 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
     else:
         out |= {"file_type": str(raw.dtype), "bits": used_bits(raw) if raw.dtype.kind == "u" else raw.dtype.itemsize * 8}
     out |= _statistics(sensor, frames, measured_frames, problems)
-    spread = sorted({round(index) for index in np.linspace(0, len(frames) - 1, min(_ENCODING_FRAMES, len(frames)))})
-    encoding = _tried(problems, encoding_of, sensor, [frames[index].path for index in spread])
+    masked = [frame for frame in frames if frame.mask is not None]
+    if masked:
+        out["foreground_percent"] = _foreground_percent(sensor, masked, measured_frames, problems)
+    encoding = _tried(problems, encoding_of, sensor, [frames[index].path for index in _spread(len(frames), _ENCODING_FRAMES)])
     out["encoding"] = None if encoding is None else asdict(encoding)
     if out["file_type"] == "uint16" and out["max"] is not None and out["max"] <= 4095 / 65535:
         problems.append(f"{sensor.name}: no value exceeds {out['max']:.3f} of full scale, as in 12-bit data that is not left-aligned.")
@@ -93,10 +98,9 @@ def _lens(camera: Camera, most: int = 250_000) -> dict[str, Any]:
 
 
 def _statistics(sensor: Sensor, frames: tuple[Frame, ...], most: int, problems: list[str]) -> dict[str, Any]:
-    chosen = sorted({round(index) for index in np.linspace(0, len(frames) - 1, min(most, len(frames)))})
     count, total, saturated, low, high = 0, 0.0, 0, math.inf, -math.inf
     measured = 0
-    for index in chosen:
+    for index in _spread(len(frames), most):
         loaded = _tried(problems, load_frame, sensor, frames[index])
         if loaded is None:
             continue
@@ -115,6 +119,20 @@ def _statistics(sensor: Sensor, frames: tuple[Frame, ...], most: int, problems: 
         "max": high,
         "saturated_percent": 100.0 * saturated / count,
     }
+
+
+def _foreground_percent(sensor: Sensor, masked: Sequence[Frame], most: int, problems: list[str]) -> float | None:
+    """Of the pixels of masks, evenly spread over the views; None where none can be read."""
+    read = [_tried(problems, read_mask, masked[index]) for index in _spread(len(masked), most)]
+    shares = [float(mask.mean()) for mask in read if mask is not None]
+    if shares and not any(shares):
+        problems.append(f"{sensor.name}: {len(shares)} masks were read and all are empty, expected pixels that are not zero.")
+    return 100.0 * float(np.mean(shares)) if shares else None
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many indices, evenly spread."""
+    return sorted({round(index) for index in np.linspace(0, count - 1, min(most, count))})
 
 
 def _tried(problems: list[str], read: Callable[..., T], *what: Any) -> T | None:
@@ -150,7 +168,8 @@ def render_text(description: dict[str, Any]) -> str:
 
 def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
     width, height = sensor["size"]
-    masks = f", {sensor['masks']} with a mask" if sensor["masks"] else ""
+    inside = "" if sensor["foreground_percent"] is None else f" (foreground: {sensor['foreground_percent']:.1f} % of the pixels)"
+    masks = f", {sensor['masks']} with a mask{inside}" if sensor["masks"] else ""
     pattern = " / ".join(" ".join(map(str, row)) for row in sensor["mosaic"] or ())
     lines = [
         f"{name}",

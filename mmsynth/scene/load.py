@@ -23,8 +23,9 @@ from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_mmsdata_points, rea
 from mmsynth.scene.layouts.nerfstudio import read_camera_path, read_nerfstudio, read_nerfstudio_points, read_transforms
 from mmsynth.scene.layouts.neus import cameras_of, read_neus
 from mmsynth.scene.layouts.tum import is_tum, read_tum
+from mmsynth.scene.masks import use_masks
 from mmsynth.scene.points import SparsePoints
-from mmsynth.scene.scene import Frame, Layout, Region, Scene, SceneSource, StatedPose
+from mmsynth.scene.scene import Frame, Layout, MaskMeaning, Region, Scene, SceneSource, StatedPose
 from mmsynth.sensors.camera import Camera, project, round_trip_error, unproject
 
 _ROUND_TRIP = 1e-3  # pixels
@@ -57,6 +58,8 @@ def load_scene(
     layout: str | None = None,
     images: Path | str | None = None,
     also: Mapping[str, str] | None = None,
+    masks: MaskMeaning | None = None,
+    mask_folder: Path | None = None,
 ) -> Scene:
     """Read a scene; its layout is recognised by the files in the folder.
 
@@ -72,20 +75,40 @@ def load_scene(
         images: folder where the pictures are, by the names that the metadata give them, with any suffix; None: where the metadata say.
         also: more sensors of a layout made for one, by name, ``FOLDER`` or ``FOLDER:calibration.json``, see ``scene.also``.
             Folders are relative to the scene's folder, or else to the working folder.
+        masks: what they mean; None: what the layout says. mask_folder: where they are, see ``masks.find_masks``; None: where the layout
+            has them.
     Raises:
-        InputError: nothing there, unknown format or modality, bad metadata, fewer than two frames to train on, or no
-            camera that sees the region of interest.
+        InputError: nothing there, unknown format or modality, bad metadata, fewer than two frames to train on, no camera that sees the
+            region of interest, or a folder without masks of this scene.
     """
     source = stated_source(Path(path), layout, images, also)
     scene = _read(source, None if source.also else modalities)
     scene = with_sensors(scene, dict(source.also), modalities)
-    return dataclasses.replace(_checked(scene, source.path), source=source)
+    return use_masks(dataclasses.replace(_checked(scene, source.path), source=source), masks, mask_folder)
 
 
-def load_again(stated: Mapping[str, Any], *, modalities: Sequence[str] | None = None) -> Scene:
-    """Read the scene of a run again: ``stated`` is what its manifest says of the scene (``serialisation.source_to_json``)."""
+def load_again(
+    stated: Mapping[str, Any],
+    *,
+    modalities: Sequence[str] | None = None,
+    masks: MaskMeaning | None = None,
+    mask_folder: Path | None = None,
+) -> Scene:
+    """Read the scene of a run again: ``stated`` is what its manifest says of the scene (``serialisation.source_to_json``).
+
+    Args:
+        masks, mask_folder: see ``use_masks``; None: as the manifest has them.
+    """
     how = {key: stated.get(key) for key in ("images", "also")}
-    return load_scene(stated["path"], modalities=modalities, layout=stated.get("format"), **how)
+    of_fit = stated.get("mask_folder")
+    return load_scene(
+        stated["path"],
+        modalities=modalities,
+        layout=stated.get("format"),
+        masks=masks or stated.get("masks"),
+        mask_folder=mask_folder or (Path(of_fit) if of_fit else None),
+        **how,
+    )
 
 
 def _checked(scene: Scene, path: Path) -> Scene:

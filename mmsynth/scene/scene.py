@@ -185,7 +185,7 @@ class Scene:
         unit: "m" where the input says so, else "input unit".
         black_background: True when the input says that what is outside the object is black or transparent,
             None when it does not say.
-        masks: what the frames' masks mean.
+        masks: what the frames' masks mean. mask_folder: where they were sought; None: where the layout has them.
         problems: one sentence each, to be shown by ``mmsynth info`` (missing images, dropped frames, ...).
         source: from what it was read; None where it was made in memory.
     """
@@ -199,6 +199,7 @@ class Scene:
     unit: str = "input unit"
     black_background: bool | None = None
     masks: MaskMeaning = "off"
+    mask_folder: Path | None = None
     problems: tuple[str, ...] = ()
     source: SceneSource | None = None
 

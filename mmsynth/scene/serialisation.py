@@ -48,7 +48,9 @@ def posed_from_json(stated: Mapping[str, Any]) -> PosedCamera:
 def source_to_json(scene: Scene) -> dict[str, Any]:
     """Where a scene is and how it was read, for ``load.load_again``."""
     source = scene.source or SceneSource(scene.root.resolve())
-    stated: dict[str, Any] = {"path": str(source.path), "format": scene.format}
+    stated: dict[str, Any] = {"path": str(source.path), "format": scene.format, "masks": scene.masks}
+    if scene.mask_folder is not None:
+        stated["mask_folder"] = str(scene.mask_folder.resolve())
     if source.images is not None:
         stated["images"] = str(source.images)
     if source.also:
@@ -73,6 +75,17 @@ def sensor_to_json(sensor: Sensor) -> dict[str, Any]:
         "mosaic": None if sensor.mosaic is None else sensor.mosaic.tolist(),
         "saturation": sensor.saturation if math.isfinite(sensor.saturation) else None,  # float images never clip; JSON has no inf
     }
+
+
+def what_scenes_add(scene: Scene) -> dict[str, Any]:
+    """What no layout for photographs holds: ``modalities`` (keys of ``known_sensors.make_sensor``), ``unit`` and ``region``."""
+    described = {
+        name: {key: value for key, value in channels_to_json(sensor).items() if value is not None}
+        | ({} if sensor.mosaic is None else {"mosaick_pattern": sensor.mosaic.tolist()})
+        for name, sensor in scene.sensors.items()
+    }
+    region = {"centre": list(scene.region.centre), "radius": scene.region.radius}
+    return {"modalities": described, "unit": scene.unit, "region": region}
 
 
 def sensor_from_json(stated: Mapping[str, Any]) -> Sensor:

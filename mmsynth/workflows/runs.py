@@ -14,7 +14,7 @@ from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
 from mmsynth.scene.load import load_again
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import MaskMeaning, Scene
 
 _RUNS = Path("runs")
 _FACTS = ("steps", "seconds", "train_psnr", "rays_per_s", "samples_per_s")
@@ -43,14 +43,17 @@ def open_field(folder: Path | None = None, *, device: str = "cpu") -> tuple[Path
     return folder, load_field(folder, device)
 
 
-def open_run(folder: Path | None = None, *, device: str = "cpu") -> Run:
-    """``open_field``, and the scene from where it was when it was fitted.
+def open_run(folder: Path | None = None, *, device: str = "cpu", masks: MaskMeaning | None = None, mask_folder: Path | None = None) -> Run:
+    """``open_field``, and the scene from where it was when it was fitted, with its masks.
 
+    Args:
+        masks, mask_folder: see ``use_masks``; None: as they were for the fit.
     Raises:
-        InputError: as ``open_field``, or the scene cannot be read.
+        InputError: as ``open_field``, or the scene or its masks cannot be read.
     """
     folder, field = open_field(folder, device=device)
-    return Run(folder, field, load_again(field.manifest["scene"], modalities=list(field.sensors)))
+    scene = load_again(field.manifest["scene"], modalities=list(field.sensors), masks=masks, mask_folder=mask_folder)
+    return Run(folder, field, scene)
 
 
 def is_run(folder: Path) -> bool:

@@ -177,7 +177,7 @@ def test_a_sparse_modality_leaves_geometry_and_appearance_alone() -> None:
 def test_a_cell_of_the_surface_is_seen_by_enough_measurements(tmp_path: Path) -> None:
     scene = _scene(tmp_path / "plain")
     measurements = load_measurements(scene)
-    pixels = sum(int(m.ends[-1]) for m in measurements.values())
+    pixels = sum(m.pixels.size for m in measurements.values())
     cells_per_pixel = 32.0  # finer than pixels, so that only the measurements limit it
 
     def at(measurements_per_cell: float) -> Needs:

@@ -405,7 +405,7 @@ def test_black_pixels_of_a_black_scene_ask_for_emptiness(tmp_path: Path) -> None
 
 def test_alpha_asks_for_opacity(tmp_path: Path) -> None:
     trainer = _trainer(_ball_scene(tmp_path, transparent_disc))
-    assert trainer.has_alpha and not trainer.needs.design.background
+    assert trainer.has_opacity and not trainer.needs.design.background
     batch = _batch(trainer, 400)
     assert set(batch.alpha.tolist()) == {0.0, 1.0}
     opacity = _opacity(trainer, batch)

@@ -3,9 +3,12 @@
 Definitions (all values linear, peak 1.0 = full scale, so PSNR = -10 log10 MSE; MSE is pooled over the pixels of all test views, not
 averaged per view in dB):
 
-* ``psnr``: raw photosites with a valid lens ray. A sensor clips, so predictions are clipped to [0, 1] here.
+* ``psnr``: raw photosites with a valid lens ray. A sensor clips, so predictions are clipped to [0, 1] here. What is transparent, or
+  outside the masks of an object, counts as black; what is outside masks that say what to ignore does not count, here and in ``ssim``.
 * ``psnr_foreground``: the same in the foreground. ``foreground_from``: "masks" (the scene's masks or alpha), "gt" (first hit in the
   region), and only where there is neither "opacity" (the field's own > 0.5: a field must not choose its own exam, so it says so).
+* ``psnr_foreground_view_mean``: the mean of dB over views, each view's MSE pooled over the pixels of its foreground. Papers on MMS-DATA
+  give this one; where views differ it is mostly the higher of the two, as a geometric mean of errors is below the arithmetic one.
 * ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
   mosaic per channel.
 * ``psnr_truth``, ``psnr_truth_full``: all channels at every pixel of the own pose against ``gt/<modality>``, in the region and
@@ -35,8 +38,9 @@ from scipy.spatial import cKDTree
 from mmsynth.errors import InputError
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.ground_truth import GroundTruth
-from mmsynth.scene.images import load_frame, read_native
-from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.scene.images import load_frame
+from mmsynth.scene.masks import read_mask
+from mmsynth.scene.scene import Frame, MaskMeaning, Scene, Sensor
 from mmsynth.sensors.camera import depth_along_rays, surface_points
 from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim, ssim_of_channels
 from mmsynth.sensors.mosaic import photosites_of
@@ -57,7 +61,7 @@ def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, 
         ``{"modalities": {name: {"psnr", "psnr_foreground", "foreground_from", "ssim", "psnr_truth", ...}}, "geometry": {...},
         "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON.
     Raises:
-        InputError: no frame of these views, or a file that cannot be read.
+        InputError: no frame of these views, a file that cannot be read, or masks that are all empty.
     """
     began = time.perf_counter()
     chosen = tuple(scene.split.test) if views is None else tuple(views)
@@ -69,6 +73,7 @@ def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, 
     exam = _Exam(field, scene, truth, count)
     for frame in frames:
         _at_own_pose(exam, frame)
+    exam.check_masks(frames)
     for frame in at_rgb:
         _at_rgb_pose(exam, frame)
     return {
@@ -94,7 +99,7 @@ class _Exam:
     """What is asked, and what was scored so far."""
 
     def __init__(self, field: Field, scene: Scene, truth: GroundTruth, count: Counter) -> None:
-        self.field, self.truth, self.count, self.metric = field, truth, count, scene.unit == "m"
+        self.field, self.truth, self.count, self.metric, self.masks = field, truth, count, scene.unit == "m", scene.masks
         names = [name for name in field.sensors if name in scene.sensors]
         self.scores = {name: _Scores() for name in names}
         self.own_pose = {name: _Scores() for name in names}
@@ -102,6 +107,14 @@ class _Exam:
         self.points: list[np.ndarray] = []
         self.true_points: list[np.ndarray] = []
         self.rays, self.seconds = 0, 0.0
+
+    def check_masks(self, frames: Sequence[Frame]) -> None:
+        """Masks of frames that were scored and have no foreground in any are an error: the score would silently be that of another."""
+        for name, scores in self.scores.items():
+            masked = [frame for frame in frames if frame.sensor == name and frame.mask is not None]
+            if masked and scores.value("psnr_foreground/masks") is None:
+                which = f"this mask of {name} and those of all its other test frames"
+                raise InputError(f"{masked[0].mask}: {which} are empty, expected pixels that are not zero.")
 
     def render(self, frame: Frame, names: Sequence[str], geometry: bool) -> Rendering:
         started = time.perf_counter()
@@ -117,7 +130,7 @@ def _at_own_pose(exam: _Exam, frame: Frame) -> None:
     rendering = exam.render(frame, [sensor.name], False)
     size = rendering.valid.shape
     region = _checked(exam.truth.region(frame), size, f"gt/masks, {sensor.name} view {frame.view}")
-    _score_raw(scores, sensor, frame, rendering, region)
+    _score_raw(scores, sensor, frame, rendering, region, exam.masks)
     light = _checked(exam.truth.image(frame), (*size, _components(sensor)), f"gt, {sensor.name} view {frame.view}")
     if light is None:
         return
@@ -208,32 +221,30 @@ def _checked(truth: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.
     return truth
 
 
-def _mask(frame: Frame) -> np.ndarray | None:
-    if frame.mask is None:
-        return None
-    mask = read_native(frame.mask)
-    mask = np.asarray(mask.any(-1) if mask.ndim == 3 else mask > 0)
-    return _checked(mask, (frame.camera.height, frame.camera.width), f"{frame.mask}")
-
-
-def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Rendering, region: np.ndarray | None) -> None:
+def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Rendering, region: np.ndarray | None, masks: MaskMeaning) -> None:
     """Against the frame as the sensor recorded it."""
     measured, alpha = load_frame(sensor, frame)
     channels = np.clip(np.nan_to_num(rendering.channels[sensor.name]), 0.0, 1.0)
+    mask, valid = read_mask(frame), rendering.valid
     if alpha is not None:
         # what is transparent was never seen
         measured = measured * alpha[..., None]
+    if mask is not None and masks == "object":
+        measured = measured * (mask if measured.ndim == 2 else mask[..., None])
+    if mask is not None and masks == "ignore":
+        valid = valid & mask
     predicted = channels if sensor.mosaic is None else photosites_of(channels, sensor.mosaic)
     squared = (predicted - measured) ** 2
-    drawn = _mask(frame)
-    if drawn is None and alpha is not None:
-        drawn = alpha > 0.5
-    foreground = {"masks": drawn, "gt": region, "opacity": rendering.opacity > 0.5}
-    scores.add("psnr", squared[rendering.valid])
-    for source, mask in foreground.items():
-        if mask is not None:
-            scores.add(f"psnr_foreground/{source}", squared[rendering.valid & mask])
-    scores.add("ssim", np.array(raw_ssim(np.clip(measured, 0.0, 1.0), predicted, rendering.valid, sensor)))
+    if mask is None and alpha is not None:
+        mask = alpha > 0.5
+    foreground = {"masks": mask, "gt": region, "opacity": rendering.opacity > 0.5}
+    scores.add("psnr", squared[valid])
+    for source, inside in foreground.items():
+        if inside is not None:
+            scores.add(f"psnr_foreground/{source}", squared[valid & inside])
+            if (valid & inside).any():
+                scores.add(f"view_mean/{source}", np.array(psnr_from_mse(float(squared[valid & inside].mean(dtype=np.float64)))))
+    scores.add("ssim", np.array(raw_ssim(np.clip(measured, 0.0, 1.0), predicted, valid, sensor)))
 
 
 def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
@@ -291,7 +302,7 @@ def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
     for source in _FOREGROUND_SOURCES:
         value = scores.value(f"psnr_foreground/{source}")
         if value is not None:
-            out |= {"psnr_foreground": value, "foreground_from": source}
+            out |= {"psnr_foreground": value, "psnr_foreground_view_mean": scores.value(f"view_mean/{source}"), "foreground_from": source}
             break
     out |= _values(scores, ("ssim", "psnr_truth", "psnr_truth_full", "psnr_aligned"))
     light = ("sam", "stokes_rmse", "dolp_rmse", "aolp_mae")

@@ -11,11 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.scene.layouts.colmap import BESIDE
 from mmsynth.scene.layouts.colmap_writer import colmap_files, rig_of
 from mmsynth.scene.layouts.mmsdata import lens_model, meta_content
 from mmsynth.scene.layouts.nerfstudio import described_transforms
 from mmsynth.scene.points import SparsePoints, ply_of
 from mmsynth.scene.scene import Frame, MaskMeaning, PosedCamera, Scene
+from mmsynth.scene.serialisation import what_scenes_add
 
 ExportLayout = Literal["mms-data", "nerfstudio", "colmap"]
 LAYOUTS: tuple[str, ...] = get_args(ExportLayout)
@@ -129,15 +131,17 @@ def _colmap(scene: Scene, poses: Mapping[int, np.ndarray], points: SparsePoints 
         # COLMAP's own way to name masks
         masks={f"masks/{picture[i]}.png": f.mask for i, f in enumerate(scene.frames) if f.mask is not None},
         index={
+            BESIDE: _json(what_scenes_add(scene)),
             "sparse/0/test.txt": "".join(f"{name}\n" for name in test).encode(),
             **{f"sparse/0/{name}": content for name, content in colmap_files(images, points).items()},
         },
+        notes=_masks_note(scene, "ignore", "COLMAP"),
     )
     if several and rig_of(images) is None:
         plan.notes.append("the sensors' poses are not those of one rigid rig with one camera each: every picture is a frame of its own.")
     if _mosaics(scene):
-        plan.notes.append(f"{_mosaics(scene)}: COLMAP has no mosaics, raw frames are grey pictures there.")
-    plan.notes.append(f"COLMAP holds no region of interest and no unit (here {scene.unit}).")
+        plan.notes.append(f"{_mosaics(scene)}: COLMAP has no mosaics, raw frames are grey pictures there; mmsynth reads {BESIDE}.")
+    plan.notes.append(f"COLMAP holds no region of interest and no unit (here {scene.unit}); they are in {BESIDE}.")
     return plan
 
 

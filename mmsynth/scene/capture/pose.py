@@ -138,7 +138,7 @@ def write_posed(posed: PosedCapture, out: Path) -> Path:
         names[captured.sensor.name, view] = f"{captured.sensor.name}/{path.name}"
         _link(path, out / "modalities" / captured.sensor.name / path.name)
     sensors = [captured.sensor for captured in posed.capture.sensors if captured.sensor.name in frames]
-    content = meta_content(out, sensors, frames, posed.region, posed.unit)
+    content = meta_content(out, sensors, frames, posed.region, posed.unit, own_cameras=True)
     _write_model(posed.structure.model, out / "sparse" / "0", names)
     write_json(out / "meta_data.json", content)
     return out

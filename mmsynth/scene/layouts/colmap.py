@@ -7,6 +7,10 @@
 * Names with subfolders are sensors of a rig, where ``frames`` say so, or where the folders hold the same names and the rotation from one
   to the other is the same at every name. Else all pictures are of one sensor, however many cameras it has.
 * Ids of views count the model's images (or instants) by name. The region of interest is that of the sparse points.
+* Test views are those that ``test.txt`` beside the model names, a picture a line. Masks are COLMAP's: ``masks/NAME.png`` beside
+  ``images``, NAME with its own suffix, black where nothing is to be learned.
+* What COLMAP does not hold may stand in ``mmsynth.json`` in the scene's folder: ``modalities`` (keys of ``known_sensors.make_sensor`` of
+  each sensor), ``region`` (``centre`` and ``radius``) and ``unit``. ``mmsynth export`` writes it.
 """
 
 from __future__ import annotations
@@ -15,19 +19,23 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.files import read_json, read_text
+from mmsynth.scene.checks import is_file
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.layouts.colmap_model import ModelImage, is_model, read_model, read_points
 from mmsynth.scene.layouts.pictures import Pictures, Resizes
 from mmsynth.scene.points import SparsePoints
-from mmsynth.scene.region import region_from_cameras, region_from_points
-from mmsynth.scene.scene import Frame, Scene, Sensor, canonical_modality, make_split
+from mmsynth.scene.region import region_from_cameras, region_from_points, stated_region
+from mmsynth.scene.scene import Frame, MaskMeaning, Region, Scene, Sensor, canonical_modality, make_split
 from mmsynth.sensors.camera import Camera
 
+BESIDE = "mmsynth.json"
 _PLACES = ("sparse/*", "sparse", "dense/*/sparse", "dense/sparse", "colmap/sparse/*", "colmap/sparse", "colmap", ".")
 _SAME_ROTATION = 3.0  # degrees, median: what reconstructions of a rig leave
 
@@ -41,7 +49,12 @@ def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Pat
     """Read the scene in a folder, as ``load_scene``."""
     taken, problems = _best_model(root, images)
     groups = _sensors_of(taken.listed)
-    sources = list(dict.fromkeys(source for source, _ in groups.values()))
+    twice = Counter(groups[image.name] for image in taken.images).most_common(1)[0]
+    if twice[1] > 1:
+        raise InputError(
+            f"{taken.folder}: {twice[1]} images of the sensor '{twice[0][0]}' are of one instant, {twice[0][1]}, expected one."
+        )
+    sources = list(dict.fromkeys(groups[image.name][0] for image in taken.images))
     first = {source: read_native(next(file for name, file in taken.files.items() if groups[name][0] == source)) for source in sources}
     names = {source: _sensor_name(source, sources, first[source]) for source in sources}
     wanted = wanted_modalities(names.values(), modalities, taken.folder)
@@ -51,26 +64,77 @@ def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Pat
     ids = {view: index for index, view in enumerate(order)}
     sensors: dict[str, Sensor] = {}
     frames: list[Frame] = []
-    for source in sources:
+    beside = read_beside(root)
+    rank = {name: place for place, name in enumerate(beside.modalities)}
+    for source in sorted(sources, key=lambda source: rank.get(names[source], len(rank))):
         name = names[source]
         if name not in wanted:
             continue
-        sensors[name] = make_sensor(name, {}, str(taken.folder), first[source], raw=False)
+        entry = beside.modalities.get(name, {})
+        sensors[name] = make_sensor(name, entry, str(root / BESIDE), first[source], raw="mosaick_pattern" in entry)
         own = [image for image in taken.images if groups[image.name][0] == source]
-        placed = [Frame(name, ids[groups[i.name][1]], taken.files[i.name], taken.cameras[i.name], i.camera_to_world, source) for i in own]
+        placed = [
+            Frame(
+                name, ids[groups[i.name][1]], (file := taken.files[i.name]), taken.cameras[i.name], i.camera_to_world, source,
+                _mask(file, i.name),
+            )
+            for i in own
+        ]  # fmt: skip
         frames += sorted(placed, key=lambda frame: frame.view)
     poses = [frame.camera_to_world for frame in frames]
     seen = region_from_cameras([frame.camera for frame in frames], poses)
     points = read_points(taken.folder)
     region = seen if points is None else region_from_points(points.positions, seen, np.stack([pose[:3, 3] for pose in poses]))
-    split = make_split(frame.view for frame in frames)
+    listed = _test_names(taken.folder)
+    test = [ids[groups[image.name][1]] for image in taken.images if image.name in listed]
+    split = make_split((frame.view for frame in frames), test, "test.txt")
     alpha = any(image.ndim == 3 and image.shape[2] in (2, 4) for image in first.values())
-    return Scene(root, "COLMAP", sensors, tuple(frames), region, split, black_background=True if alpha else None, problems=tuple(problems))
+    masks: MaskMeaning = "ignore" if any(frame.mask is not None for frame in frames) else "off"
+    return Scene(
+        root, "COLMAP", sensors, tuple(frames), beside.region or region, split, beside.unit or "input unit", True if alpha else None,
+        masks=masks, problems=tuple(problems),
+    )  # fmt: skip
 
 
 def read_colmap_points(root: Path, images: Path | None = None) -> SparsePoints | None:
     """The sparse points of the model that ``read_colmap`` takes."""
     return read_points(_best_model(root, images)[0].folder)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What ``mmsynth.json`` says: sensors by canonical name, region and unit, None where it does not."""
+
+    modalities: Mapping[str, Mapping[str, Any]]
+    region: Region | None = None
+    unit: str | None = None
+
+
+def read_beside(root: Path) -> Beside:
+    """Read ``mmsynth.json``, if there is one. Raises InputError: not an object of these keys."""
+    path = root / BESIDE
+    if not path.is_file():
+        return Beside({})
+    content = read_json(path)
+    described = content.get("modalities", {}) if isinstance(content, dict) else None
+    if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
+        raise InputError(f"{path}: expected an object, and in it 'modalities', an object of objects.")
+    modalities = {canonical_modality(name): entry for name, entry in described.items()}
+    return Beside(modalities, stated_region(content, path), str(content["unit"]) if "unit" in content else None)
+
+
+def _test_names(folder: Path) -> set[str]:
+    path = folder / "test.txt"
+    return {line.strip() for line in read_text(path).splitlines()} if path.is_file() else set()
+
+
+def _mask(file: Path, name: str) -> Path | None:
+    """The mask of a picture, which the model calls ``name`` and which lies at ``file``."""
+    depth = len(PurePosixPath(name).parts)
+    if depth > len(file.parents):  # a picture that lies elsewhere than its name says
+        return None
+    mask = file.parents[depth - 1].parent / "masks" / f"{name}.png"
+    return mask if is_file(mask) else None
 
 
 # --- the model that belongs to the pictures
@@ -172,12 +236,12 @@ def _not_in_model(model: _Fitting) -> list[Path]:
 def _sensors_of(images: Sequence[ModelImage]) -> Mapping[str, tuple[str, str]]:
     """Name of an image → its sensor, as the model spells it, and its view."""
     folder = {image.name: str(PurePosixPath(image.name).parent) for image in images}
-    framed = [image for image in images if image.frame is not None]
-    if framed:
-        by_camera = {image.camera_id: folder[image.name] for image in framed}
+    if any(image.frame is not None for image in images):
+        by_camera = {image.camera_id: folder[image.name] for image in images}
         named = len(set(by_camera.values())) == len(by_camera)
-        sensor = {image.name: folder[image.name] if named else f"camera{image.camera_id}" for image in framed}
-        return {image.name: (sensor[image.name], f"{image.frame:012d}") for image in framed}
+        sensor = {image.name: folder[image.name] if named else f"camera{image.camera_id}" for image in images}
+        # what is in no frame is an instant of its own
+        return {i.name: (sensor[i.name], i.name if i.frame is None else f"{i.frame:012d}") for i in images}
     folders = list(dict.fromkeys(folder.values()))
     stems = {place: {PurePosixPath(i.name).stem: i for i in images if folder[i.name] == place} for place in folders}
     if len(folders) > 1 and all(_on_one_rig(stems[folders[0]], stems[other]) for other in folders[1:]):

@@ -30,7 +30,7 @@ from mmsynth.scene.images import read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.layouts.pictures import Pictures, Resizes, without_suffix
 from mmsynth.scene.points import SparsePoints, read_ply_points
-from mmsynth.scene.region import region_from_cameras, region_from_points
+from mmsynth.scene.region import region_from_cameras, region_from_points, stated_region
 from mmsynth.scene.scene import (
     MAX_VIEW,
     OPENGL_TO_OPENCV,
@@ -41,11 +41,10 @@ from mmsynth.scene.scene import (
     Sensor,
     Split,
     StatedPose,
-    ball,
     canonical_modality,
     make_split,
 )
-from mmsynth.scene.serialisation import channels_to_json
+from mmsynth.scene.serialisation import what_scenes_add
 from mmsynth.sensors.camera import COEFFICIENTS, Camera, Lens
 
 _BROWN_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -87,21 +86,10 @@ def read_nerfstudio(path: Path, modalities: Sequence[str] | None = None, images:
     frames = _frames(meta, listed, files, names, sizes, path, problems)
     plain = {source: sensors[names[source]].channel_count for source in sizes if sensors[names[source]].mosaic is None}
     alpha = any(first[source].ndim == 3 and first[source].shape[2] > count for source, count in plain.items())
-    region = _stated_region(meta, path) or _region(meta, root, sensors, frames, problems)
+    region = stated_region(meta, path) or _region(meta, root, sensors, frames, problems)
     split = _split(meta, frames, path)
-    transparent = True if alpha else None
-    return Scene(
-        root,
-        "nerfstudio",
-        sensors,
-        tuple(frames),
-        region,
-        split,
-        str(meta.get("unit", "input unit")),
-        transparent,
-        "ignore",
-        tuple(problems),
-    )
+    unit, black = str(meta.get("unit", "input unit")), True if alpha else None
+    return Scene(root, "nerfstudio", sensors, tuple(frames), region, split, unit, black, "ignore", problems=tuple(problems))
 
 
 def _source(frame: Mapping[str, Any]) -> str:
@@ -155,20 +143,6 @@ def _frames(
         if (one.sensor, one.view) == (two.sensor, two.view):
             raise InputError(f"{path}: view {one.view} of '{one.sensor}' is listed twice, expected every view once.")
     return frames
-
-
-def _stated_region(meta: Mapping[str, Any], path: Path) -> Region | None:
-    if "region" not in meta:
-        return None
-    where, entry = f"{path}: key 'region'", meta["region"]
-    complaint = f"{where} is {entry!r}, expected an object with 'centre', three numbers, and 'radius'."
-    centre = numbers(entry.get("centre") if isinstance(entry, dict) else None, complaint)
-    if centre.shape != (3,) or not np.isfinite(centre).all():
-        raise InputError(complaint)
-    radius = number(entry, "radius", where, low=0.0)
-    if radius == 0:
-        raise InputError(f"{where}: radius 0, expected a positive number.")
-    return ball(centre, radius)
 
 
 def _region(meta: Mapping[str, Any], root: Path, sensors: Mapping[str, Sensor], frames: Sequence[Frame], problems: list[str]) -> Region:
@@ -309,14 +283,8 @@ def described_transforms(scene: Scene, listed: Sequence[tuple[Frame, PosedCamera
     for entry, (frame, _, mask) in zip(content["frames"], listed, strict=True):
         entry |= {"view": frame.view, "modality": frame.sensor} | ({} if mask is None else {"mask_path": mask})
     named = lambda views: [posed.name for frame, posed, _ in listed if frame.view in views]
-    described = {
-        name: {key: value for key, value in channels_to_json(sensor).items() if value is not None}
-        | ({} if sensor.mosaic is None else {"mosaick_pattern": sensor.mosaic.tolist()})
-        for name, sensor in scene.sensors.items()
-    }
     return content | {
-        "train_filenames": named(scene.split.train), "test_filenames": named(scene.split.test), "modalities": described,
-        "unit": scene.unit, "region": {"centre": list(scene.region.centre), "radius": scene.region.radius},
+        "train_filenames": named(scene.split.train), "test_filenames": named(scene.split.test), **what_scenes_add(scene),
     }  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera, project
 
 Writer = Callable[..., Path]
-OURS: tuple[ExportLayout, ...] = ("mms-data", "nerfstudio")  # layouts whose readers are ours, and tell sensors apart
+OURS: tuple[ExportLayout, ...] = ("mms-data", "nerfstudio", "colmap")
 
 
 def files_of(root: Path) -> dict[str, bytes]:
@@ -36,7 +36,17 @@ def files_of(root: Path) -> dict[str, bytes]:
 
 
 def same_scene(back: Scene, scene: Scene) -> None:
-    """Sensors, split, region and pixels exactly, poses and intrinsics to 1e-9, and so where points are seen."""
+    """Sensors, split, region and pixels exactly, poses and intrinsics to 1e-9, and so where points are seen.
+
+    A COLMAP model has no ids of views: there they count what it has.
+    """
+    if back.format == "COLMAP":
+        ids = sorted({frame.view for frame in scene.frames})
+        back = replace(
+            back,
+            frames=tuple(replace(frame, view=ids[frame.view]) for frame in back.frames),
+            split=Split(tuple(ids[view] for view in back.split.train), tuple(ids[view] for view in back.split.test), ""),
+        )
     assert list(back.sensors) == list(scene.sensors)
     for name, sensor in scene.sensors.items():
         other = back.sensors[name]
