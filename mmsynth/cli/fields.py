@@ -48,10 +48,10 @@ def info(
     """What is in a scene: sensors, frames, mosaics, lens validity, problems."""
     from mmsynth.scene.info import describe_scene, render_text
     from mmsynth.scene.load import load_scene
-    from mmsynth.scene.masks import use_masks
 
-    read = load_scene(scene_path(scene), layout=layout, images=images, also=sensor_folders(also))
-    description = describe_scene(use_masks(read, *masks_of(masks)))
+    meaning, folder = masks_of(masks)
+    read = load_scene(scene_path(scene), layout=layout, images=images, also=sensor_folders(also), masks=meaning, mask_folder=folder)
+    description = describe_scene(read)
     print(json.dumps(description) if as_json else render_text(description))
 
 
@@ -80,13 +80,16 @@ def fit(
     from mmsynth.fitting.trainer import FitProgress
     from mmsynth.report.text import fit_text
     from mmsynth.scene.load import load_scene
-    from mmsynth.scene.masks import use_masks
     from mmsynth.scene.scene import keep_frames
     from mmsynth.workflows.fit import fit_run
 
     seconds = fit_length(steps, budget)
-    read = load_scene(scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also))
-    loaded = use_masks(keep_frames(read, frame_limits(frames)), *masks_of(masks))
+    meaning, folder = masks_of(masks)
+    read = load_scene(
+        scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also),
+        masks=meaning, mask_folder=folder,
+    )  # fmt: skip
+    loaded = keep_frames(read, frame_limits(frames))
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")

@@ -35,13 +35,14 @@ def fit_text(facts: Mapping[str, Any]) -> str:
 def score_text(scores: Mapping[str, Any]) -> str:
     """The result of ``evaluate`` as lines: one row per modality, then geometry and speed."""
     modalities: Mapping[str, Mapping[str, Any]] = scores["modalities"]
-    keys = [k for k in _COLUMNS if any(k in m for m in modalities.values())]
+    sources = {m["foreground_from"] for m in modalities.values() if "foreground_from" in m}
+    told = {k for m in modalities.values() for k in m} - ({"psnr_foreground_view_mean"} if "masks" not in sources else set())
+    keys = [k for k in _COLUMNS if k in told]
     lines = ["".join([f"{'modality':10s}"] + [f"{_COLUMNS[k]:>12s}" for k in keys])]
     for name, m in modalities.items():
         lines.append("".join([f"{name:10s}"] + [f"{m[k]:12.3f}" if isinstance(m.get(k), float) else f"{'':12s}" for k in keys]))
-    sources = {m["foreground_from"] for m in modalities.values() if "foreground_from" in m}
-    if sources:
-        lines.append("foreground: dB of the error pooled over all views; view mean: the mean of dB over views")
+    if "masks" in sources:
+        lines.append("foreground: within the masks, dB of the error pooled over all views; view mean: the mean of dB over views")
     if "opacity" in sources:
         lines.append("foreground: the field's own opacity > 0.5, for want of masks; not comparable between fits")
     lines += [f"{key}: {value:.5g}" for key, value in scores.get("geometry", {}).items() if isinstance(value, float)]

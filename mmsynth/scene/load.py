@@ -58,6 +58,8 @@ def load_scene(
     layout: str | None = None,
     images: Path | str | None = None,
     also: Mapping[str, str] | None = None,
+    masks: MaskMeaning | None = None,
+    mask_folder: Path | None = None,
 ) -> Scene:
     """Read a scene; its layout is recognised by the files in the folder.
 
@@ -73,14 +75,16 @@ def load_scene(
         images: folder where the pictures are, by the names that the metadata give them, with any suffix; None: where the metadata say.
         also: more sensors of a layout made for one, by name, ``FOLDER`` or ``FOLDER:calibration.json``, see ``scene.also``.
             Folders are relative to the scene's folder, or else to the working folder.
+        masks: what they mean; None: what the layout says. mask_folder: where they are, see ``masks.find_masks``; None: where the layout
+            has them.
     Raises:
-        InputError: nothing there, unknown format or modality, bad metadata, fewer than two frames to train on, or no
-            camera that sees the region of interest.
+        InputError: nothing there, unknown format or modality, bad metadata, fewer than two frames to train on, no camera that sees the
+            region of interest, or a folder without masks of this scene.
     """
     source = stated_source(Path(path), layout, images, also)
     scene = _read(source, None if source.also else modalities)
     scene = with_sensors(scene, dict(source.also), modalities)
-    return dataclasses.replace(_checked(scene, source.path), source=source)
+    return use_masks(dataclasses.replace(_checked(scene, source.path), source=source), masks, mask_folder)
 
 
 def load_again(
@@ -96,9 +100,15 @@ def load_again(
         masks, mask_folder: see ``use_masks``; None: as the manifest has them.
     """
     how = {key: stated.get(key) for key in ("images", "also")}
-    scene = load_scene(stated["path"], modalities=modalities, layout=stated.get("format"), **how)
     of_fit = stated.get("mask_folder")
-    return use_masks(scene, masks or stated.get("masks"), mask_folder or (Path(of_fit) if of_fit else None))
+    return load_scene(
+        stated["path"],
+        modalities=modalities,
+        layout=stated.get("format"),
+        masks=masks or stated.get("masks"),
+        mask_folder=mask_folder or (Path(of_fit) if of_fit else None),
+        **how,
+    )
 
 
 def _checked(scene: Scene, path: Path) -> Scene:

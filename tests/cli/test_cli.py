@@ -8,12 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from mmsynth.cli import app
 from mmsynth.packaged import data_folder
+from mmsynth.scene.load import load_scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -89,6 +91,27 @@ def test_evaluate(fitted: Path) -> None:
         assert {"psnr", "psnr_foreground", "ssim", "psnr_truth"} <= set(modality)
         assert modality["foreground_from"] == "gt"
     assert scores["rays_per_s"] > 0 and scores["seconds"]
+
+
+def test_masks_of_a_folder_are_learned_from_and_remembered(tmp_path: Path) -> None:
+    """An archive of masks as MMS-DATA has it, beside the example; a fit that they mean an object to, scored with the same ones."""
+    for frame in load_scene(data_folder("example_scene")).frames:
+        inside = np.zeros((frame.camera.height, frame.camera.width), np.uint8)
+        inside[len(inside) // 4 : -len(inside) // 4, inside.shape[1] // 4 : -inside.shape[1] // 4] = 255
+        path = tmp_path / f"archive/masks/scenes/example_scene/modalities/{frame.source_name}/mask_{frame.view}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), inside)
+    about = json.loads(here(tmp_path, "info", "example", "--masks", "archive", "--json").stdout)
+    assert about["masks"] == "off" and all(0 < sensor["foreground_percent"] < 50 for sensor in about["sensors"].values())
+    result = here(tmp_path, "fit", "example", "--masks", "archive", "--masks", "object", "--steps", "3", "--modalities", "rgb,mono")
+    assert result.returncode == 0 and "masks: object: nothing is outside; inside are rgb 25" in result.stdout, result.stdout + result.stderr
+    (tmp_path / "elsewhere").mkdir()
+    scores = json.loads(here(tmp_path / "elsewhere", "evaluate", "--run", "../runs/latest", "--json").stdout)["modalities"]
+    assert {m["foreground_from"] for m in scores.values()} == {"masks"} and all("psnr_foreground_view_mean" in m for m in scores.values())
+    assert "view mean" in here(tmp_path, "evaluate", "--masks", "ignore").stdout
+    refused(here(tmp_path, "fit", "example", "--masks", "nowhere"), "nowhere", "expected one of masks, or object, ignore or off")
+    refused(here(tmp_path, "fit", "example", "--masks", "off", "--masks", "object"), "expected one of object, ignore, off, and one folder")
+    refused(here(tmp_path, "info", "example", "--masks", "elsewhere"), "elsewhere", "none of its 0 pictures")
 
 
 def test_convert(fitted: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import random
+import struct
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 import tomli_w
 from conftest import HEIGHT, OPENCV_TO_OPENGL, WIDTH, frame_values, ring
+from scipy.spatial.transform import Rotation
 
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
@@ -231,6 +234,100 @@ def _damaged_trajectory(content: list[dict[str, Any]], dice: random.Random) -> b
     return _as_damaged_json(dice.choice(content), dice)
 
 
+def _blender(root: Path) -> dict[str, Any]:
+    _pixels(root, [f"train/r_{i}.png" for i in range(4)])
+    frames = [
+        {"file_path": f"./train/r_{i}", "rotation": 0.1, "transform_matrix": (pose @ OPENCV_TO_OPENGL).tolist()}
+        for i, pose in enumerate(ring(4))
+    ]
+    return {"camera_angle_x": 0.8, "w": 48.0, "h": 36.0, "frames": frames}
+
+
+def _colmap(root: Path) -> dict[str, str]:
+    """The files of a model by name, a rig of two sensors."""
+    names = [f"{folder}/{i:04d}.png" for folder in ("rgb", "nir") for i in range(3)]
+    _pixels(root / "images", names)
+    lines = []
+    for i, (name, pose) in enumerate(zip(names, ring(3) * 2, strict=True), 1):
+        there = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(there[:3, :3]).as_quat()
+        lines.append(" ".join(map(str, (i, w, x, y, z, *there[:3, 3], 1 + i // 4, name))) + "\n1.5 2.5 -1")
+    frames = [f"{i} 1 1 0 0 0 0 0 0 2 CAMERA 1 {i} CAMERA 2 {i + 3}" for i in range(1, 4)]
+    return {
+        "cameras.txt": "1 OPENCV 24 18 25 26 12 9 0.1 0.2 0 0\n2 OPENCV_FISHEYE 24 18 25 26 12 9 0 0 0 0",
+        "images.txt": "\n".join(lines),
+        "frames.txt": "\n".join(frames),
+        "points3D.txt": "\n".join(f"{i} 0.{i} 0 0 1 2 3 0.5 1 0 2 0 3 0" for i in range(9)),
+    }
+
+
+def _damaged_model(content: dict[str, str], dice: random.Random) -> bytes:
+    """All of the files, one of them damaged."""
+    chosen = dice.choice(list(content))
+    return b"\0".join(_damaged_text(text, dice) if name == chosen else text.encode() for name, text in content.items())
+
+
+def _load_model(path: Path) -> object:
+    parts = path.read_bytes().split(b"\0")
+    for name, text in zip(("cameras.txt", "images.txt", "frames.txt", "points3D.txt"), parts, strict=False):
+        (path.parent / name).write_bytes(text)
+    return load_scene(path.parent, layout="colmap")
+
+
+def _colmap_binary(root: Path) -> bytes:
+    """Two files as one, cut where the first ends."""
+    _pixels(root, [f"{i:04d}.png" for i in range(4)])
+    cameras = struct.pack("<QIiQQ8d", 1, 7, 4, 24, 18, 25.0, 26.0, 12.0, 9.0, 0.1, 0.2, 0.0, 0.0)
+    images = [struct.pack("<Q", 4)]
+    for i, pose in enumerate(ring(4)):
+        there = np.linalg.inv(pose)
+        x, y, z, w = Rotation.from_matrix(there[:3, :3]).as_quat()
+        images.append(
+            struct.pack("<I7dI", i, w, x, y, z, *there[:3, 3], 7) + f"{i:04d}.png\0".encode() + struct.pack("<Q2dq", 1, 1.0, 2.0, -1)
+        )
+    return cameras + b"".join(images)
+
+
+def _damaged_bytes(content: bytes, dice: random.Random) -> bytes:
+    """Bytes replaced, or the end cut off."""
+    damaged = bytearray(content)
+    for _ in range(dice.choice((1, 1, 2, 8))):
+        damaged[dice.randrange(len(damaged))] = dice.choice((0, 1, 255, dice.randrange(256)))
+    return bytes(damaged[: dice.randrange(len(damaged))] if dice.random() < 0.3 else damaged)
+
+
+def _load_binary(path: Path) -> object:
+    data, size = path.read_bytes(), struct.calcsize("<QIiQQ8d")
+    (path.parent / "cameras.bin").write_bytes(data[:size])
+    (path.parent / "images.bin").write_bytes(data[size:])
+    return load_scene(path.parent)
+
+
+def _scene_toml(root: Path) -> dict[str, Any]:
+    (root / "transforms.json").write_text(json.dumps(_transforms(root)))
+    _pixels(root / "nir", [f"{i:04d}.png" for i in range(4)])
+    return {"layout": "nerfstudio", "images": "images", "also": {"nir": "nir"}}
+
+
+def _neus(root: Path) -> dict[str, Any]:
+    _pixels(root / "image", [f"{i:03d}.png" for i in range(4)])
+    matrix = np.array([[25.0, 0, 11.7, 0], [0, 26.0, 8.4, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    worlds = {f"world_mat_{i}": (matrix @ np.linalg.inv(pose)).tolist() for i, pose in enumerate(ring(4))}
+    return worlds | {f"scale_mat_{i}": np.eye(4).tolist() for i in range(4)}
+
+
+def _damaged_npz(content: Any, dice: random.Random) -> bytes:
+    """Arrays of any shape and type, or bytes that are no archive."""
+    damaged = _damage(content, dice)
+    stream = io.BytesIO()
+    try:
+        np.savez(stream, **{str(key): np.asarray(value) for key, value in damaged.items()})
+    except (ValueError, OverflowError, TypeError, AttributeError):
+        np.savez(stream, world_mat_0=np.eye(3))
+    data = stream.getvalue()
+    return data[: dice.randrange(len(data))] if dice.random() < 0.1 else data
+
+
 def _load_folder(path: Path) -> object:
     return load_scene(path.parent)
 
@@ -246,6 +343,11 @@ CASES: dict[str, _Case] = {
     "poses.json": (120, lambda root: _rig(), _as_damaged_json, read_poses),
     "trajectory.json": (200, lambda root: _TRAJECTORIES, _damaged_trajectory, _trajectory),
     "toy_par.txt": (200, _par, _damaged_text, _load_folder),
+    "transforms_train.json": (200, _blender, _as_damaged_json, _load_folder),
+    "model.files": (150, _colmap, _damaged_model, _load_model),
+    "model.bytes": (150, lambda root: _colmap_binary(root), _damaged_bytes, _load_binary),
+    "cameras_sphere.npz": (150, _neus, _damaged_npz, _load_folder),
+    "scene.toml": (100, _scene_toml, _as_damaged_toml, _load_folder),
     "images.txt": (200, lambda root: _COLMAP, _damaged_text, read_poses),
     "cameras.txt": (150, _cameras, _damaged_text, lambda path: read_poses(path.parent)),
     "path.tum": (150, lambda root: _TUM, _damaged_text, read_poses),

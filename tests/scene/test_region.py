@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import look_at, ring
 
-from mmsynth.scene.region import region_from_cameras, region_from_points
-from mmsynth.sensors.camera import Camera
+from mmsynth.scene.region import region_from_cameras, region_from_points, region_from_silhouettes
+from mmsynth.sensors.camera import Camera, unproject
 
 CAMERA = Camera(24, 18, 25.0, 25.0, 11.5, 8.5)
 
@@ -74,3 +74,28 @@ def test_degenerate_cameras_give_a_finite_region(name: str) -> None:
     if name == "one camera":
         ahead = np.linalg.inv(poses[0]) @ [*region.centre, 1.0]
         np.testing.assert_allclose(ahead[:3], (0, 0, 1), atol=1e-12)
+
+
+def _silhouette(camera: Camera, pose: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """(H, W) which pixels see a ball: those whose rays pass its centre within its radius."""
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    directions = unproject(np.stack([columns, rows], -1).reshape(-1, 2).astype(float), camera)[0] @ pose[:3, :3].T
+    away = centre - pose[:3, 3]
+    along = directions @ away
+    return ((along > 0) & (away @ away - along**2 < radius**2)).reshape(camera.height, camera.width)
+
+
+@pytest.mark.parametrize("radius", [0.08, 0.3])
+def test_silhouettes_fit_the_region_to_the_object(radius: float) -> None:
+    """A small ball off the middle: the region holds it and is hardly larger, with one bad mask in twenty-four and no silhouette at all."""
+    camera = Camera(240, 180, 250.0, 250.0, 119.5, 89.5)
+    poses = [*ring(12, 3.0, 1.0), *ring(12, 3.0, -2.0)]
+    centre = np.array([0.25, -0.1, 0.15])
+    seen = region_from_cameras([camera] * 24, poses)
+    silhouettes = [_silhouette(camera, pose, centre, radius) for pose in poses]
+    silhouettes[5] = np.zeros_like(silhouettes[5])
+    region = region_from_silhouettes(silhouettes, [camera] * 24, poses, seen)
+    cell = 2 * seen.radius / 48
+    assert np.linalg.norm(region.centre - centre) + radius <= region.radius <= radius + 4 * cell
+    assert region_from_silhouettes([np.zeros((180, 240), bool)] * 24, [camera] * 24, poses, seen) == seen
+    assert region_from_silhouettes([np.ones((180, 240), bool)] * 24, [camera] * 24, poses, seen) == seen

@@ -81,6 +81,19 @@ def reconstruct(
     return replace(found, lost=lost, notes=(*notes, *_weak(pycolmap, database)))
 
 
+def scaled(structure: Structure, scale: float) -> Structure:
+    """The same in another unit, of which ``scale`` are one of the old."""
+    structure.model.transform(load_pycolmap().Sim3d(scale=scale))
+
+    def place(pose: np.ndarray) -> np.ndarray:
+        out = pose.copy()
+        out[:3, 3] *= scale
+        return out
+
+    registered = {shot: replace(r, camera_to_world=place(r.camera_to_world)) for shot, r in structure.registered.items()}
+    return replace(structure, registered=registered, points=scale * structure.points)
+
+
 # --- mapping
 
 
@@ -114,16 +127,24 @@ def _map(pycolmap: Any, database: Path, folder: Path, work: Path, pictures: Sequ
 
 
 def _finish(pycolmap: Any, model: Any, pictures: Sequence[Picture]) -> None:
-    """One adjustment of everything, with the principal points of cameras that many pictures are of."""
-    if all(picture.known for picture in pictures):
-        return
+    """One robust adjustment of everything, with the principal points of cameras that many pictures are of.
+
+    Mapping takes every match within four pixels at its word. With Cauchy's loss, as wide as the median error, those that are off count
+    little: poses of a rig of pictures of 160x120 came half as far from the truth.
+    """
+    known = all(picture.known for picture in pictures)
     of_camera: dict[int, int] = defaultdict(int)
     for image in model.images.values():
         of_camera[image.camera_id] += image.has_pose
-    if min(count for count in of_camera.values() if count) < WELL_SEEN:
-        return
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, refine_sensor_from_rig=False, print_summary=False)
+    centred = not known and min(count for count in of_camera.values() if count) >= WELL_SEEN
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=not known, refine_extra_params=not known, refine_principal_point=centred, refine_sensor_from_rig=False,
+        print_summary=False,
+    )  # fmt: skip
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = float(np.median([point.error for point in model.points3D.values()]))
     options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = 1e-6
     pycolmap.bundle_adjustment(model, options)
 
 

@@ -15,15 +15,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mmsynth.errors import InputError
 from mmsynth.files import read_json
 from mmsynth.scene.checks import objects, rigid_pose
-from mmsynth.scene.images import read_native
+from mmsynth.scene.images import load_frame, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
 from mmsynth.scene.layouts.nerfstudio import file_name, frame_camera
 from mmsynth.scene.layouts.pictures import Pictures, Resizes
-from mmsynth.scene.region import region_from_cameras
-from mmsynth.scene.scene import OPENGL_TO_OPENCV, Frame, Scene, make_split
+from mmsynth.scene.region import region_from_cameras, region_from_silhouettes
+from mmsynth.scene.scene import OPENGL_TO_OPENCV, Frame, Region, Scene, Sensor, make_split
 from mmsynth.sensors.camera import Camera
 
 SPLITS = ("train", "val", "test")
@@ -75,11 +77,26 @@ def read_blender(root: Path, modalities: Sequence[str] | None = None, images: Pa
     placed = tuple(Frame(name, f.view, f.path, f.camera, f.camera_to_world, name) for f in frames)
     alpha = first.ndim == 3 and first.shape[2] > sensor.channel_count
     region = region_from_cameras([f.camera for f in frames], [f.camera_to_world for f in frames])
+    region = _region_of_alpha(sensor, [f for f in placed if f.view not in testing], region) if alpha else region
     stated = make_split((f.view for f in frames), testing, file_of(root, present[-1]).name)
     problems += resizes.problems()
     return Scene(
         root, "Blender", {name: sensor}, placed, region, stated, black_background=True if alpha else None, problems=tuple(problems)
     )
+
+
+def _region_of_alpha(sensor: Sensor, frames: Sequence[Frame], seen: Region, most: int = 24) -> Region:
+    """Where the silhouettes of some pictures meet, of none that test; damaged ones are passed over."""
+    chosen: list[tuple[np.ndarray, Frame]] = []
+    for index in sorted({round(value) for value in np.linspace(0, len(frames) - 1, min(most, len(frames)))}):
+        try:
+            alpha = load_frame(sensor, frames[index])[1]
+        except InputError:
+            continue
+        if alpha is not None:
+            chosen.append((alpha > 0, frames[index]))
+    silhouettes = [silhouette for silhouette, _ in chosen]
+    return region_from_silhouettes(silhouettes, [f.camera for _, f in chosen], [f.camera_to_world for _, f in chosen], seen)
 
 
 def _meta(path: Path) -> dict[str, Any]:

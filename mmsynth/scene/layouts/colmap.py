@@ -49,7 +49,12 @@ def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Pat
     """Read the scene in a folder, as ``load_scene``."""
     taken, problems = _best_model(root, images)
     groups = _sensors_of(taken.listed)
-    sources = list(dict.fromkeys(source for source, _ in groups.values()))
+    twice = Counter(groups[image.name] for image in taken.images).most_common(1)[0]
+    if twice[1] > 1:
+        raise InputError(
+            f"{taken.folder}: {twice[1]} images of the sensor '{twice[0][0]}' are of one instant, {twice[0][1]}, expected one."
+        )
+    sources = list(dict.fromkeys(groups[image.name][0] for image in taken.images))
     first = {source: read_native(next(file for name, file in taken.files.items() if groups[name][0] == source)) for source in sources}
     names = {source: _sensor_name(source, sources, first[source]) for source in sources}
     wanted = wanted_modalities(names.values(), modalities, taken.folder)
@@ -125,8 +130,10 @@ def _test_names(folder: Path) -> set[str]:
 
 def _mask(file: Path, name: str) -> Path | None:
     """The mask of a picture, which the model calls ``name`` and which lies at ``file``."""
-    images = file.parents[len(PurePosixPath(name).parts) - 1]
-    mask = images.parent / "masks" / f"{name}.png"
+    depth = len(PurePosixPath(name).parts)
+    if depth > len(file.parents):  # a picture that lies elsewhere than its name says
+        return None
+    mask = file.parents[depth - 1].parent / "masks" / f"{name}.png"
     return mask if is_file(mask) else None
 
 
@@ -229,12 +236,12 @@ def _not_in_model(model: _Fitting) -> list[Path]:
 def _sensors_of(images: Sequence[ModelImage]) -> Mapping[str, tuple[str, str]]:
     """Name of an image → its sensor, as the model spells it, and its view."""
     folder = {image.name: str(PurePosixPath(image.name).parent) for image in images}
-    framed = [image for image in images if image.frame is not None]
-    if framed:
-        by_camera = {image.camera_id: folder[image.name] for image in framed}
+    if any(image.frame is not None for image in images):
+        by_camera = {image.camera_id: folder[image.name] for image in images}
         named = len(set(by_camera.values())) == len(by_camera)
-        sensor = {image.name: folder[image.name] if named else f"camera{image.camera_id}" for image in framed}
-        return {image.name: (sensor[image.name], f"{image.frame:012d}") for image in framed}
+        sensor = {image.name: folder[image.name] if named else f"camera{image.camera_id}" for image in images}
+        # what is in no frame is an instant of its own
+        return {i.name: (sensor[i.name], i.name if i.frame is None else f"{i.frame:012d}") for i in images}
     folders = list(dict.fromkeys(folder.values()))
     stems = {place: {PurePosixPath(i.name).stem: i for i in images if folder[i.name] == place} for place in folders}
     if len(folders) > 1 and all(_on_one_rig(stems[folders[0]], stems[other]) for other in folders[1:]):

@@ -14,7 +14,7 @@ Optional keys of a modality that MMS-DATA does not have and that describe any ot
 (a number or null per channel), ``polarizer_angles_deg`` (per channel, from image right towards image up). At the top: ``unit``, of the
 frame that ``worldtogt`` leads to, where it is not metres, and ``test_ids``, the test views of a scene without ground truth images. Lenses
 that MMS-DATA does not have: ``camera_model`` FULL_OPENCV with the eight distortion_params k1 k2 p1 p2 k3 k4 k5 k6, and OPENCV_FISHEYE
-with Kannala-Brandt's k1 k2 k3 k4.
+with Kannala-Brandt's k1 k2 k3 k4. A frame may state a camera of its own, by the keys of a modality's.
 """
 
 from __future__ import annotations
@@ -81,8 +81,7 @@ def read_mmsdata(root: Path, modalities: Sequence[str] | None = None, images: Pa
             continue
         where = f"{path}: modality '{source}'"
         entry = _modality(meta, source, where)
-        camera = _camera(meta, entry, path, where)
-        present, missing = _frames(entry, where, root, folder / source, source, name, camera, to_output, scale)
+        present, missing = _frames(_stated_frames(meta, entry, path, where, to_output, scale), root, folder / source, source, name)
         if not present:
             raise InputError(f"{where} has no image files in {folder / source}; leave it out to use the other modalities.")
         if missing:
@@ -116,20 +115,26 @@ def read_reference_poses(path: Path) -> list[StatedPose]:
     source = next(iter(meta["modalities"]))
     where = f"{path}: modality '{source}'"
     entry = _modality(meta, source, where)
-    camera = _camera(meta, entry, path, where)
     to_output, scale, _ = _world_to_output(meta, path)
-    frames = sorted(_stated_frames(entry, where, to_output, scale), key=lambda frame: frame[0])
-    return [StatedPose(camera, pose, Path(file_name).stem) for _, file_name, pose in frames]
+    frames = sorted(_stated_frames(meta, entry, path, where, to_output, scale), key=lambda frame: frame[0])
+    return [StatedPose(camera, pose, Path(file_name).stem) for _, file_name, camera, pose in frames]
 
 
 def meta_content(
-    root: Path, sensors: Sequence[Sensor], frames: Mapping[str, Mapping[int, PosedCamera]], region: Region, unit: str
+    root: Path,
+    sensors: Sequence[Sensor],
+    frames: Mapping[str, Mapping[int, PosedCamera]],
+    region: Region,
+    unit: str,
+    *,
+    own_cameras: bool = False,
 ) -> dict[str, Any]:
     """What ``meta_data.json`` says of a scene: the content of the file, that ``write_json`` takes.
 
     Args:
         root: to name in errors. region: becomes the scene box.
         frames: by sensor and view id, named by their files; poses in the region's frame.
+        own_cameras: frames may have other cameras than their modality, which MMS-DATA's own tools pass over.
     Raises:
         InputError: what the format does not hold: a sensor whose camera changes, frames with all channels at every pixel beside mosaics,
             of a modality that is known to have one.
@@ -139,17 +144,13 @@ def meta_content(
     raw = any(s.mosaic is not None for s in sensors)
     modalities = {}
     for sensor in sensors:
-        cameras = {frame.camera for frame in frames[sensor.name].values()}
-        if len(cameras) != 1:
-            raise InputError(f"{root}: {len(cameras)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames.")
-        (camera,) = cameras
+        (camera, _), *others = Counter(frame.camera for frame in frames[sensor.name].values()).most_common()
+        if others and not own_cameras:
+            raise InputError(f"{root}: {1 + len(others)} cameras of '{sensor.name}', expected one: MMS-DATA has one for all frames.")
         if raw and sensor.mosaic is None and sensor.channel_count > 1 and sensor.name in KNOWN:
             raise InputError(f"{root}: '{sensor.name}' has no mosaic, which MMS-DATA does not hold beside sensors that have one.")
-        model = lens_model(camera)
         entry: dict[str, Any] = {
-            "camera_model": model,
-            **{key: value for key, value in camera_to_json(camera).items() if key not in ("lens", "distortion")},
-            "distortion_params": camera.coefficients[: len(_MODELS[model])].tolist(),
+            **_camera_entry(camera),
             **{key: value for key, value in channels_to_json(sensor).items() if value is not None},
         }
         if raw and (sensor.mosaic is not None or sensor.channel_count == 1):
@@ -158,7 +159,10 @@ def meta_content(
         for view, frame in frames[sensor.name].items():
             moved = frame.camera_to_world.copy()
             moved[:3, 3] = to_world[:3, :3] @ moved[:3, 3] + to_world[:3, 3]
-            entry["frames"].append({"frame_id": view, "file_name": frame.name, "camtoworld": (moved @ OPENGL_TO_OPENCV)[:3].tolist()})
+            own = {} if frame.camera == camera else _camera_entry(frame.camera)
+            entry["frames"].append(
+                {"frame_id": view, "file_name": frame.name, "camtoworld": (moved @ OPENGL_TO_OPENCV)[:3].tolist(), **own}
+            )
         modalities[sensor.name] = entry
     return {
         "undistorted": False, "raw": raw, "pixel_offset": 0.0,
@@ -167,6 +171,16 @@ def meta_content(
         "unit": unit,
         "modalities": modalities,
     }  # fmt: skip
+
+
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    """Size, intrinsics and lens."""
+    model = lens_model(camera)
+    return {
+        "camera_model": model,
+        **{key: value for key, value in camera_to_json(camera).items() if key not in ("lens", "distortion")},
+        "distortion_params": camera.coefficients[: len(_MODELS[model])].tolist(),
+    }
 
 
 def lens_model(camera: Camera) -> str:
@@ -235,21 +249,11 @@ def _camera(meta: Mapping[str, Any], entry: Mapping[str, Any], path: Path, where
     return make_camera(where, size, (fx, fy, cx - offset, cy - offset), distortion, lens)
 
 
-def _frames(
-    entry: Mapping[str, Any],
-    where: str,
-    root: Path,
-    folder: Path,
-    source: str,
-    name: str,
-    camera: Camera,
-    to_output: np.ndarray,
-    scale: float,
-) -> tuple[list[Frame], int]:
+def _frames(stated: Iterable[Stated], root: Path, folder: Path, source: str, name: str) -> tuple[list[Frame], int]:
     """Frames with an image file, by view, and the count of those without."""
     present: dict[int, Frame] = {}
     missing = 0
-    for view, file_name, pose in _stated_frames(entry, where, to_output, scale):
+    for view, file_name, camera, pose in stated:
         path = folder / file_name
         if not is_file(path):
             missing += 1
@@ -259,8 +263,14 @@ def _frames(
     return [present[view] for view in sorted(present)], missing
 
 
-def _stated_frames(entry: Mapping[str, Any], where: str, to_output: np.ndarray, scale: float) -> Iterator[tuple[int, str, np.ndarray]]:
-    """View id, file name and camera_to_world (4, 4) of what a modality lists, in its order; poses in the frame of the Scene."""
+Stated = tuple[int, str, Camera, np.ndarray]  # view id, file name, camera, camera_to_world (4, 4)
+
+
+def _stated_frames(
+    meta: Mapping[str, Any], entry: Mapping[str, Any], path: Path, where: str, to_output: np.ndarray, scale: float
+) -> Iterator[Stated]:
+    """What a modality lists, in its order; poses in the frame of the Scene."""
+    camera = _camera(meta, entry, path, where)
     seen: set[int] = set()
     for index, item in enumerate(objects(entry, "frames", where)):
         view = whole(item, "frame_id", f"{where}, frame entry {index}", 0, MAX_VIEW)
@@ -272,7 +282,7 @@ def _stated_frames(entry: Mapping[str, Any], where: str, to_output: np.ndarray, 
             raise InputError(f"{here}: key 'file_name' is {item.get('file_name', 'missing')!r}, expected the name of an image file.")
         pose = rigid_pose(item.get("camtoworld"), here) @ OPENGL_TO_OPENCV
         pose[:3, 3] *= scale  # then the rigid part: together s R x + t
-        yield view, item["file_name"], to_output @ pose
+        yield view, item["file_name"], _camera(meta, {**entry, **item}, path, here) if "fx" in item else camera, to_output @ pose
 
 
 def _split(root: Path, meta: Mapping[str, Any], views: Iterable[int]) -> Split:

@@ -14,7 +14,10 @@ from analytic import MS, RGB, AnalyticField, scene_of, sphere
 from mmsynth.errors import InputError
 from mmsynth.field.field import Rendering
 from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim
+from mmsynth.report.text import score_text
 from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.images import load_frame
+from mmsynth.scene.scene import MaskMeaning, Scene
 from mmsynth.sensors.metrics import spectral_angle_deg
 
 
@@ -105,6 +108,61 @@ def test_empty_mask_is_left_out(tmp_path: Path) -> None:
     result = score(field, scene_of(field, tmp_path, truth=False))
     assert "psnr_foreground" not in result["modalities"]["ms"]
     json.dumps(result, allow_nan=False)
+
+
+def _masked(scene: Scene, masks: MaskMeaning, folder: Path, mask: np.ndarray) -> Scene:
+    write_png16(folder / "mask.png", mask.astype(float))
+    return replace(scene, masks=masks, frames=tuple(replace(f, mask=folder / "mask.png") for f in scene.frames))
+
+
+def test_foreground_is_scored_pooled_and_as_the_mean_of_db_over_views(tmp_path: Path) -> None:
+    """Errors of 0.1 in one view and of 0.001 in the other: 20 and 60 dB."""
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path, truth=False)
+    inside = np.zeros((18, 24), bool)
+    inside[5:9, 7:13] = True
+    errors = iter([0.1, 0.001])
+
+    class Off(AnalyticField):
+        def render(self, *args: Any, **kwargs: Any) -> Rendering:
+            out, error = super().render(*args, **kwargs), next(errors)
+            return replace(out, channels={n: c + error for n, c in out.channels.items()})
+
+    found = score(Off(sphere(), [RGB]), _masked(scene, "off", tmp_path, inside), views=[2, 3])["modalities"]["rgb"]
+    assert found["foreground_from"] == "masks"
+    assert found["psnr_foreground"] == pytest.approx(-10 * np.log10((0.1**2 + 0.001**2) / 2), abs=0.02)
+    assert found["psnr_foreground_view_mean"] == pytest.approx((20 + 60) / 2, abs=0.1)
+    text = score_text({"modalities": {"rgb": found}})
+    assert "foreground" in text and "view mean" in text and f"{found['psnr_foreground_view_mean']:.3f}" in text
+
+
+@pytest.mark.parametrize(("masks", "black", "counts"), [("object", True, True), ("ignore", False, False), ("off", False, True)])
+def test_what_is_outside_a_mask_is_black_or_not_scored_or_as_recorded(
+    masks: MaskMeaning, black: bool, counts: bool, tmp_path: Path
+) -> None:
+    """Frames whose outside was painted white, by two fields: one black there, one white."""
+    inside = np.zeros((18, 24), bool)
+    inside[5:13, 7:17] = True
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path, truth=False)
+    for frame in scene.frames:
+        write_png16(frame.path, np.where(inside, load_frame(RGB, frame)[0], 1.0))
+    scene = _masked(scene, masks, tmp_path, inside)
+
+    def psnr(light: float) -> dict[str, Any]:
+        paint = lambda out: {"channels": {n: np.where(inside[..., None], c, light) for n, c in out.channels.items()}}
+        return score(Changed(paint, sphere(), [RGB]), scene)["modalities"]["rgb"]
+
+    dark, bright = psnr(0.0), psnr(1.0)
+    assert dark["psnr_foreground"] > 90 and bright["psnr_foreground"] > 90
+    assert (dark["psnr"] > 90) == (black or not counts) and (bright["psnr"] > 90) == (not black)
+
+
+def test_masks_that_are_all_empty_are_refused(tmp_path: Path) -> None:
+    field = AnalyticField(sphere(), [RGB])
+    scene = _masked(scene_of(field, tmp_path), "off", tmp_path, np.zeros((18, 24)))
+    with pytest.raises(InputError, match=r"mask.png: this mask of rgb and those of all its other test frames are empty"):
+        score(field, scene)
 
 
 def test_views(tmp_path: Path) -> None:

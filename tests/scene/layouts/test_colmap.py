@@ -258,6 +258,18 @@ def test_subfolders_are_sensors_of_a_rig(tmp_path: Path) -> None:
     assert list(load_scene(tmp_path, modalities=["thermal"]).sensors) == ["thermal"]
 
 
+def test_a_sensor_without_files_and_one_that_is_listed_twice(tmp_path: Path) -> None:
+    root = folders(tmp_path, [pose @ PLACE for pose in ring(4)], [1] * 4 + [2] * 4)
+    shutil.rmtree(root / "images" / "thermal")
+    scene = load_scene(root)
+    assert len(scene.frames) == 4 and any("4 of 8 images" in text for text in scene.problems)
+    names = ["rgb/0.png", "rgb/0.webp", "rgb/1.png", "nir/0.png", "nir/1.png"]
+    one, two, _ = ring(3)
+    poses = [one, one, two, one, two]
+    with pytest.raises(InputError, match="2 images of the sensor 'rgb' are of one instant, 0, expected one"):
+        load_scene(scene_folder(tmp_path / "twice", names=names, poses=poses, cameras=[1, 1, 1, 2, 2]))
+
+
 def test_subfolders_of_one_camera_or_of_two_walks_are_no_rig(tmp_path: Path) -> None:
     """The same names in two folders say nothing when the cameras are one, or turn against each other."""
     one = load_scene(folders(tmp_path / "one", [pose @ PLACE for pose in ring(4)], [1] * 8))
