@@ -51,6 +51,7 @@ def calibrate(
 def pose(
     capture: Annotated[Path, typer.Argument(help="a folder of photographs, one folder for each sensor, or a source scene of MMS-DATA")],
     calibration: Annotated[Path | None, typer.Option(help="calibration.json of the rig; default: the capture's own")] = None,
+    board: Annotated[Path | None, typer.Option(help="board.toml of boards in the scene, for metres")] = None,
     reference: Annotated[str | None, typer.Option(help="sensor that the others stand by; default: the calibration's first, or rgb")] = None,
     out: Annotated[Path | None, typer.Option(help="the scene's folder; default: NAME_scene")] = None,
     as_json: JsonOption = False,
@@ -60,5 +61,5 @@ def pose(
     from mmsynth.workflows.pose import pose_scene
 
     with progress_bar("pose", as_json) as show:
-        facts = pose_scene(capture, out, calibration=calibration, reference=reference, progress=show)
+        facts = pose_scene(capture, out, calibration=calibration, board=board, reference=reference, progress=show)
     print(json.dumps(facts) if as_json else pose_text(facts))
