@@ -125,7 +125,8 @@ def _with_sensor(scene: Scene, name: str, text: str) -> Scene:
             continue
         pose = frame.camera_to_world if rig is None else frame.camera_to_world @ rig.camera_to_reference
         camera = resizes.fitted(frame.camera if rig is None else rig.camera, file)
-        frames.append(Frame(name, frame.view, file, camera, pose, name))
+        mask = frame.mask if rig is None and camera == frame.camera else None  # seen from the same place, the object has the same outline
+        frames.append(Frame(name, frame.view, file, camera, pose, name, mask))
     if not frames:
         raise InputError(f"{folder}: no picture in it is called as one of '{reference}', expected names such as {listed[0].path.stem}.")
     described: Mapping[str, Any] = {} if rig is None else rig.described

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mmsynth.report.pose import write_pose_report
+from mmsynth.scene.capture.board import read_boards
 from mmsynth.scene.capture.pose import PosedCapture, Progress, pose_capture, write_posed
 from mmsynth.scene.capture.source import read_capture
 
@@ -18,13 +19,15 @@ def pose_scene(
     out: Path | None = None,
     *,
     calibration: Path | None = None,
+    board: Path | None = None,
     reference: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Find the poses of a capture and write the scene, COLMAP's model and ``report.html``.
 
     Args:
-        out: the scene's folder; None: ``NAME_scene`` here. The others: see ``read_capture`` and ``pose_capture``.
+        out: the scene's folder; None: ``NAME_scene`` here. board: ``board.toml`` of boards that stand in the scene.
+        The others: see ``read_capture`` and ``pose_capture``.
     Returns:
         what ``pose_facts`` says of it, and scene, the folder, and seconds.
     Raises:
@@ -33,7 +36,7 @@ def pose_scene(
     start = time.perf_counter()
     found = read_capture(capture, calibration, reference)
     folder = out or Path(f"{found.root.resolve().name}_scene")
-    posed = pose_capture(found, progress=progress)
+    posed = pose_capture(found, () if board is None else read_boards(board), progress=progress)
     write_posed(posed, folder)
     facts = pose_facts(posed) | {"scene": str(folder), "seconds": time.perf_counter() - start}
     write_pose_report(folder / "report.html", posed, facts)

@@ -102,6 +102,22 @@ def test_one_mask_serves_the_sensors_that_see_the_same(write_mmsdata: Callable[.
     assert set(_having(masked)) == {("rgb", 0), ("nir", 0), ("rgb", 1)}
 
 
+@pytest.mark.parametrize(("half", "masked"), [(False, {"rgb", "nir"}), (True, {"rgb"})], ids=["same camera", "half size"])
+def test_a_sensor_beside_has_the_masks_of_the_pictures_that_it_matches(
+    half: bool, masked: set[str], write_transforms: Callable[..., Path]
+) -> None:
+    def with_masks(meta: dict) -> None:  # type: ignore[type-arg]
+        for frame in meta["frames"]:
+            frame["mask_path"] = "mask.png"
+
+    root = write_transforms(edit=with_masks)
+    _write(root / "mask.png")
+    for view in range(4):
+        _write(root / f"nir/{view:04d}.png", np.full((HEIGHT, WIDTH), 40 + view, np.uint8)[:: 1 + half, :: 1 + half])
+    scene = load_scene(root, also={"nir": "nir"})
+    assert {frame.sensor for frame in scene.frames if frame.mask is not None} == masked
+
+
 def test_bad_masks_are_one_sentence(write_mmsdata: Callable[..., Path], tmp_path: Path) -> None:
     scene = load_scene(write_mmsdata())
 

@@ -6,7 +6,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +16,17 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_json
+from mmsynth.scene.capture.board import Board
 from mmsynth.scene.capture.matching import Picture, Shot, focal_length_of, load_pycolmap
 from mmsynth.scene.capture.matching_picture import matching_picture
+from mmsynth.scene.capture.metric import BoardScale, scale_of_boards
 from mmsynth.scene.capture.source import Capture, check_size, pictures_of
-from mmsynth.scene.capture.structure import Structure, reconstruct
+from mmsynth.scene.capture.structure import Structure, reconstruct, scaled
 from mmsynth.scene.image_writers import write_png
 from mmsynth.scene.images import read_native
 from mmsynth.scene.layouts.mmsdata import meta_content
 from mmsynth.scene.region import region_from_cameras, region_from_points
-from mmsynth.scene.scene import PosedCamera, Region
+from mmsynth.scene.scene import Frame, PosedCamera, Region
 from mmsynth.sensors.camera import Camera
 
 _FOCAL = 1.2  # of the longer side, where nothing is known: 45 degrees
@@ -51,12 +53,14 @@ class PosedCapture:
     notes: tuple[str, ...]
 
 
-def pose_capture(capture: Capture, *, progress: Progress | None = None) -> PosedCapture:
+def pose_capture(capture: Capture, boards: Sequence[Board] = (), *, progress: Progress | None = None) -> PosedCapture:
     """Find the pose of every picture.
 
     Sensors that are calibrated keep their intrinsics and lens, and with places on a rig of several sensors one pose is found for each
     instant, in metres. Other cameras are found with the poses.
 
+    Args:
+        boards: that stand in the scene, from which the unit is found; on a calibrated rig they only check its baselines.
     Raises:
         InputError: as ``reconstruct``, or a picture that cannot be read or has not the size that the calibration says.
     """
@@ -69,14 +73,36 @@ def pose_capture(capture: Capture, *, progress: Progress | None = None) -> Posed
         pictures, lost = _prepare(capture, folder, progress)
         structure = reconstruct(folder, work, pictures, rig if as_rig else None, str(capture.root))
     baselines = [float(np.linalg.norm(place[:3, 3])) for place in rig.values()] if as_rig else []
+    notes = [*capture.notes, *structure.notes]
+    unit, unit_from = "input unit", "the reconstruction's own unit, because neither a board nor a rig's baselines were given"
+    found = _board_scale(capture, structure, boards) if boards else None
     if any(baselines):
         unit, unit_from = "m", f"metres, from the rig's {len(baselines) - 1} baselines of up to {max(baselines):.3g} m"
-    else:
-        unit, unit_from = "input unit", "the reconstruction's own unit, because neither a board nor a rig's baselines were given"
+        if found:
+            apart = 1.0 / found.scale - 1.0
+            notes.append(f"By the boards' {found.corners} corners lengths are {apart:+.3%} off (± {found.deviation:.3%}); the rig's count.")
+    elif found:
+        structure = scaled(structure, found.scale)
+        seen_by = f"{found.corners} corners of {found.boards_seen} boards seen in {found.frames} frames"
+        unit, unit_from = "m", f"metres, from {seen_by}, to {found.deviation:.2%}"
     shots = structure.registered.values()
     seen = region_from_cameras([shot.camera for shot in shots], [shot.camera_to_world for shot in shots])
     region = region_from_points(structure.points, seen, np.stack([shot.camera_to_world[:3, 3] for shot in shots]))
-    return PosedCapture(capture, structure, region, unit, unit_from, {**lost, **structure.lost}, (*capture.notes, *structure.notes))
+    return PosedCapture(capture, structure, region, unit, unit_from, {**lost, **structure.lost}, tuple(notes))
+
+
+def _board_scale(capture: Capture, structure: Structure, boards: Sequence[Board]) -> BoardScale:
+    """By the first sensor that sees boards."""
+    problems = []
+    for captured in capture.sensors:
+        name = captured.sensor.name
+        shots = {view: shot for (of, view), shot in structure.registered.items() if of == name}
+        frames = [Frame(name, v, captured.files[v], shot.camera, shot.camera_to_world) for v, shot in shots.items()]
+        try:
+            return scale_of_boards(frames, captured.sensor, boards, str(capture.root))
+        except InputError as error:
+            problems.append(error)
+    raise problems[0]
 
 
 def _prepare(capture: Capture, folder: Path, progress: Progress | None) -> tuple[list[Picture], dict[Shot, str]]:

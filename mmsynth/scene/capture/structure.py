@@ -81,6 +81,19 @@ def reconstruct(
     return replace(found, lost=lost, notes=(*notes, *_weak(pycolmap, database)))
 
 
+def scaled(structure: Structure, scale: float) -> Structure:
+    """The same in another unit, of which ``scale`` are one of the old."""
+    structure.model.transform(load_pycolmap().Sim3d(scale=scale))
+
+    def place(pose: np.ndarray) -> np.ndarray:
+        out = pose.copy()
+        out[:3, 3] *= scale
+        return out
+
+    registered = {shot: replace(r, camera_to_world=place(r.camera_to_world)) for shot, r in structure.registered.items()}
+    return replace(structure, registered=registered, points=scale * structure.points)
+
+
 # --- mapping
 
 
