@@ -2,6 +2,7 @@
 
 What a command does is one call:
 
+* ``mmsynth calibrate``: ``calibrate_rig`` → ``Calibration``: a rig from frames of boards, with its files.
 * ``mmsynth info``: ``load_scene`` → ``Scene``: sensors, frames with cameras and poses, split, problems.
 * ``mmsynth fit``: ``fit_run`` → ``Run``: a fit with its report and ``runs/latest``. ``fit``: the field alone.
 * ``mmsynth evaluate``: ``evaluate_run(open_run())``, ``evaluate_conversions``. ``evaluate``: the scores alone.
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from mmsynth.scene.load import load_scene
     from mmsynth.sensors.twin import SensorTwin
     from mmsynth.workflows.batch import run_batch
+    from mmsynth.workflows.calibrate import calibrate_rig
     from mmsynth.workflows.fit import evaluate_run, fit_run
     from mmsynth.workflows.pose import pose_scene
     from mmsynth.workflows.runs import Run, open_run
@@ -73,6 +75,7 @@ _NAMES = {
     "scene.load": "load_scene",
     "sensors.twin": "SensorTwin",
     "workflows.batch": "run_batch",
+    "workflows.calibrate": "calibrate_rig",
     "workflows.fit": "evaluate_run fit_run",
     "workflows.pose": "pose_scene",
     "workflows.runs": "Run open_run",
@@ -80,10 +83,10 @@ _NAMES = {
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
-    "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise", "convert",
-    "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "export_scene", "extract_mesh", "fit", "fit_run",
-    "generate_dataset", "load_recipe", "load_scene", "mesh_to_file", "open_run", "pose_scene", "run_batch", "simulate", "verify_dataset",
-    "write_mesh",
+    "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise",
+    "calibrate_rig", "convert", "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "export_scene", "extract_mesh",
+    "fit", "fit_run", "generate_dataset", "load_recipe", "load_scene", "mesh_to_file", "open_run", "pose_scene", "run_batch", "simulate",
+    "verify_dataset", "write_mesh",
 ]  # fmt: skip
 
 

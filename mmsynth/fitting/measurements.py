@@ -231,8 +231,9 @@ def _inside(frames: tuple[Frame, ...], valid: list[np.ndarray], masks: MaskMeani
             mask = np.full(usable.shape, masks == "ignore")
             usable = usable & mask
         inside.append(usable & mask.reshape(-1))
-        outside.append(usable & ~mask.reshape(-1))
-    empty = Pixels(outside) if masks == "object" else None
+        if masks == "object":
+            outside.append(usable & ~mask.reshape(-1))
+    empty = Pixels(outside) if outside else None
     return Pixels(inside), empty if empty is not None and empty.size else None
 
 

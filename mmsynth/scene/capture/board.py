@@ -128,6 +128,20 @@ def corner_points(board: Board) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=64)
+def marker_points(board: Board, legacy: bool = False) -> dict[int, np.ndarray]:
+    """(4, 3) metres: the corners of every marker of a ChArUco board, from its upper left one clockwise, by id.
+
+    Args:
+        legacy: as OpenCV before 4.6 drew boards with an even number of rows, beginning with a white square.
+    """
+    ids = np.arange(board.first_id, board.first_id + board.squares[0] * board.squares[1] // 2)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    drawn = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker or 0.0, dictionary, ids)
+    drawn.setLegacyPattern(legacy)
+    return {int(i): np.reshape(corners, (4, 3)).astype(np.float64) for i, corners in zip(drawn.getIds(), drawn.getObjPoints(), strict=True)}
+
+
+@functools.lru_cache(maxsize=64)
 def turns(board: Board) -> tuple[np.ndarray, np.ndarray]:
     """The quarter turns of a board that bring its corners onto its corners.
 

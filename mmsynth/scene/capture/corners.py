@@ -22,7 +22,7 @@ _AWAY = 0.3  # of a square's shortest side [px] by which a corner may move, or t
 
 def refine_saddles(
     picture: np.ndarray, weight: np.ndarray, pixels: np.ndarray, across: np.ndarray, clear: float = 0.5
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Corners to a few hundredths of a pixel.
 
     Args:
@@ -30,9 +30,12 @@ def refine_saddles(
         pixels: (N, 2) where corners are, to a pixel or two; across: (N, 2, 2) pixels for one square to the right and one down, in columns.
         clear: distance from the edges [squares] up to which white squares are plain: beyond it there are markers.
     Returns:
-        (N, 2) pixels, NaN where there is no such corner, and (N,) their standard deviation [px] by the pixels' scatter around the model.
+        (N, 2) pixels, NaN where there is no such corner; (N,) their standard deviation [px] by the pixels' scatter around the model; and
+        (N,) 1 where the squares to the upper left and lower right of the board's axes are the white ones, else -1.
     """
     height, width = picture.shape
+    flat = np.abs(np.linalg.det(across)) < 2.0  # px²: seen edge on, or misread
+    across = np.where(flat[:, None, None], np.eye(2), across)
     side = np.linalg.norm(across, axis=1).min(1)  # (N,) pixels
     reach = int(np.clip(np.ceil(_REACH * np.sqrt(2) * np.median(side)), 2, _WINDOW))
     dv, du = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, 1, -1)
@@ -64,10 +67,10 @@ def refine_saddles(
 
     moved = np.linalg.norm(parameters[:, :2] - pixels, axis=1)
     good = (moved < np.maximum(2.0, _AWAY * side)) & (parameters[:, 6] * white > 0.3) & (residual < 0.4)
-    good &= ((mask > 0).sum(1) > 14) & (parameters[:, 4] < 1.6)
+    good &= ~flat & ((mask > 0).sum(1) > 14) & (parameters[:, 4] < 1.6)
     turned = np.sin(parameters[:, 3] - parameters[:, 2]) / np.sin(angle[:, 1] - angle[:, 0])
     good &= np.isfinite(moved) & (turned > 0.3)
-    return np.where(good[:, None], parameters[:, :2], np.nan), np.sqrt(np.maximum(covariance, 0.0))
+    return np.where(good[:, None], parameters[:, :2], np.nan), np.sqrt(np.maximum(covariance, 0.0)), white
 
 
 def _gauss_newton(p: np.ndarray, x: np.ndarray, value: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

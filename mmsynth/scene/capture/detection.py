@@ -7,7 +7,6 @@ and white. OpenCV finds the boards in that picture; ``corners`` refines them on 
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from mmsynth.scene.capture.board import Board, corner_points, turns
 from mmsynth.scene.capture.corners import refine_saddles
+from mmsynth.scene.capture.markers import Markers, chart_corners, find_markers_in
 
 _SMALL, _LARGE = 2_000_000, 9_000_000  # pixels: pictures are made larger up to the first for finding, and smaller down to the second
 _LEAST = 6  # corners of a board that count as one
@@ -54,14 +54,21 @@ def find_boards(raw: np.ndarray, boards: Sequence[Board], pattern: np.ndarray | 
     tile = (1, 1) if pattern is None or raw.ndim == 3 else (pattern.shape[0], pattern.shape[1])
     mosaic = np.asarray(raw, dtype=np.float32) if raw.ndim == 2 else _grey(raw)
     picture = level_channels(mosaic, tile)
+    markers: dict[tuple[str, bool], Markers] = {}
     found: list[Detection] = []
-    markers: dict[tuple[str, bool, float], _Markers] = {}
     for index, board in enumerate(boards):
-        seen = _find(picture, board, markers)
-        if seen is None and tile != (1, 1):  # a coarser picture has no mosaic: each pixel is the mean of a tile
-            seen = _find_in_tiles(mosaic, tile, board)
-        if seen is not None:
-            found += _refined(mosaic, picture, tile, index, board, *seen)
+        if board.kind == "charuco":
+            key = board.dictionary, board.inverted
+            if key not in markers:
+                markers[key] = _markers(picture, *key)
+            guesses = chart_corners(board, markers[key])
+        else:
+            guess = _find(picture, board)
+            if guess is None and tile != (1, 1):  # a coarser picture has no mosaic: each pixel is the mean of a tile
+                guess = _find_in_tiles(mosaic, tile, board)
+            guesses = [] if guess is None else [guess]
+        seen = [one for guess in guesses if (one := _refined(mosaic, picture, tile, index, board, *guess)) is not None]
+        found += sorted(seen, key=lambda one: -len(one.ids))[:1]
     return found
 
 
@@ -90,42 +97,49 @@ def _grey(picture: np.ndarray) -> np.ndarray:
 
 
 _Seen = tuple[np.ndarray, np.ndarray]  # ids (N,), pixels (N, 2)
-_Markers = tuple[Sequence[np.ndarray], np.ndarray]
 
 
-def _find(picture: np.ndarray, board: Board, markers: dict[tuple[str, bool, float], _Markers] | None = None) -> _Seen | None:
-    """The most corners of a board at any scale of the picture."""
-    best: _Seen | None = None
+def _find(picture: np.ndarray, board: Board) -> _Seen | None:
+    """The corners of a chessboard or the circles of a grid at the first scale of the picture at which they are found."""
     for scale in _scales(picture.shape):
         grey = _scaled(picture, scale)
         if board.inverted:
             grey = 255 - grey
-        if board.kind == "charuco":
-            seen = _charuco(grey, board, {} if markers is None else markers, scale)
-        else:
-            seen = _circles(grey, board) if board.kind == "circles" else _chessboard(grey, board)
-        if seen is not None and (best is None or len(seen[0]) > len(best[0])):
-            # OpenCV resizes about the pictures' corners: pixel centres are at +0.5
-            best = seen[0], (seen[1].astype(np.float64) + 0.5) / scale - 0.5
-        if best is not None and len(best[0]) == len(corner_points(board)):
-            break
-    return None if best is None or len(best[0]) < _LEAST else best
+        seen = _circles(grey, board) if board.kind == "circles" else _chessboard(grey, board)
+        if seen is not None:
+            return seen[0], unscaled(seen[1], scale)
+    return None
 
 
 def _scales(shape: tuple[int, ...]) -> list[float]:
     size = shape[0] * shape[1]
     if size > _LARGE:
         return [float(np.sqrt(_LARGE / size)), 1.0]
-    return [1.0] + [scale for scale in (2.0, 4.0) if size * scale**2 <= _SMALL]
+    return [1.0] + [scale for scale in (2.0, 4.0, 6.0) if size * scale**2 <= _SMALL]
+
+
+def _markers(picture: np.ndarray, dictionary: str, inverted: bool) -> Markers:
+    """The corners of markers at all scales; of a marker that is found at several, those of the largest."""
+    out: Markers = {}
+    for scale in _scales(picture.shape):
+        grey = _scaled(picture, scale)
+        found = find_markers_in(255 - grey if inverted else grey, dictionary)
+        out.update({marker: unscaled(corners, scale) for marker, corners in found.items()})
+    return out
+
+
+def unscaled(pixels: np.ndarray, scale: float) -> np.ndarray:
+    """Pixels of a resized picture in the picture itself: OpenCV resizes about the corners, and pixel centres are at +0.5."""
+    return (np.asarray(pixels, dtype=np.float64) + 0.5) / scale - 0.5
 
 
 def _scaled(picture: np.ndarray, scale: float) -> np.ndarray:
     """(H, W) uint8 for a detector: square roots, so that a board in the shade is seen beside a lamp."""
     low, high = np.quantile(picture, 0.001), np.quantile(picture, 0.995)
     level = np.sqrt(np.clip((picture - low) / max(float(high - low), 1e-12), 0.0, 1.0))
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     level = level if scale == 1 else cv2.resize(level, None, fx=scale, fy=scale, interpolation=way)
-    return (255 * level + 0.5).astype(np.uint8)
+    return (255 * np.clip(level, 0, 1) + 0.5).astype(np.uint8)
 
 
 def _find_in_tiles(mosaic: np.ndarray, tile: tuple[int, int], board: Board) -> _Seen | None:
@@ -135,42 +149,6 @@ def _find_in_tiles(mosaic: np.ndarray, tile: tuple[int, int], board: Board) -> _
         return None
     seen = _find(mosaic[: rows * h, : columns * w].reshape(rows, h, columns, w).mean((1, 3)), board)
     return None if seen is None else (seen[0], (seen[1] + 0.5) * [w, h] - 0.5)
-
-
-def _charuco(grey: np.ndarray, board: Board, known: dict[tuple[str, bool, float], _Markers], scale: float) -> _Seen | None:
-    key = (board.dictionary, board.inverted, scale)
-    if key not in known:
-        corners, ids, _ = cv2.aruco.ArucoDetector(_dictionary(board.dictionary)).detectMarkers(grey)
-        known[key] = corners, np.zeros(0, int) if ids is None else np.ravel(ids)
-    corners, ids = known[key]
-    own = [k for k, i in enumerate(ids) if board.first_id <= i < board.first_id + board.squares[0] * board.squares[1] // 2]
-    if not own:
-        return None
-    best: _Seen | None = None
-    for detector in _detectors(board):
-        found, which, _, _ = detector.detectBoard(
-            grey, markerCorners=[corners[k] for k in own], markerIds=ids[own].reshape(-1, 1).astype(np.int32)
-        )
-        if which is not None and (best is None or len(which) > len(best[0])):
-            best = np.ravel(which), np.reshape(found, (-1, 2))
-    return best
-
-
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-
-
-@functools.lru_cache(maxsize=32)
-def _detectors(board: Board) -> tuple[cv2.aruco.CharucoDetector, ...]:
-    """OpenCV before 4.6 began boards with an even number of rows with a white square; the markers on them tell which it is."""
-    assert board.marker is not None  # its model has checked
-    out = []
-    for legacy in (False, True) if board.squares[1] % 2 == 0 else (False,):
-        ids = np.arange(board.first_id, board.first_id + board.squares[0] * board.squares[1] // 2)
-        drawn = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, _dictionary(board.dictionary), ids)
-        drawn.setLegacyPattern(legacy)
-        out.append(cv2.aruco.CharucoDetector(drawn))
-    return tuple(out)
 
 
 def _chessboard(grey: np.ndarray, board: Board) -> _Seen | None:
@@ -212,24 +190,62 @@ def _facing(pixels: np.ndarray) -> np.ndarray:
 
 def _refined(
     mosaic: np.ndarray, picture: np.ndarray, tile: tuple[int, int], index: int, board: Board, ids: np.ndarray, pixels: np.ndarray
-) -> list[Detection]:
+) -> Detection | None:
     order = np.argsort(ids)
     ids, pixels = ids[order].astype(np.int64), pixels[order].astype(np.float64)
     if board.kind == "circles":
-        return [Detection(index, ids, pixels, np.full(len(ids), np.nan))]
+        return Detection(index, ids, pixels, np.full(len(ids), np.nan))
     weight = np.ones_like(picture)
     blind: tuple[tuple[int, int], ...] = ()
     if tile != (1, 1):
         picture, weight, blind = level_on_board(mosaic, tile, pixels)
-    clear = 0.5 if board.marker is None else (1 - board.marker / board.square) / 2
-    across = local_squares(board, ids, pixels)
-    for _ in range(2):  # again from where the first has led: the window lies better
-        fine, deviation = refine_saddles(picture, weight, pixels, across, clear)
+    known: dict[int, tuple[np.ndarray, float]] = {}
+    for round_ in range(2 * max(board.grid)):  # again from where the last has led, with the neighbours of what was found
+        if np.linalg.matrix_rank(corner_points(board)[ids, :2] - corner_points(board)[ids[0], :2], tol=1e-9) < 2:
+            break  # on one line, nothing tells where the next line is
+        fine, deviation, sign = _saddles(picture, weight, board, ids, pixels)
         good = np.isfinite(fine).all(-1)
-        pixels = np.where(good[:, None], fine, pixels)
-    if good.sum() < _LEAST:
-        return []
-    return [Detection(index, ids[good], fine[good], deviation[good], blind)]
+        # black and white alternate: what has the wrong sign is a corner of something else
+        parity = (-1.0) ** (ids // board.grid[0] + ids % board.grid[0]) * sign
+        good &= parity == (1.0 if (parity[good] > 0).sum() * 2 > good.sum() else -1.0)
+        fresh = {int(i): (place, float(spread)) for i, place, spread in zip(ids[good], fine[good], deviation[good], strict=True)}
+        if len(fresh) < 4 or (len(fresh) <= len(known) and known):
+            break
+        known = fresh
+        ids, pixels = _with_neighbours(board, known, picture.shape)
+        if len(ids) == len(known) and round_ > 0:
+            break
+    if len(known) < _LEAST:
+        return None
+    final = np.array(sorted(known))
+    return Detection(index, final, np.stack([known[i][0] for i in final]), np.array([known[i][1] for i in final]), blind)
+
+
+def _saddles(
+    picture: np.ndarray, weight: np.ndarray, board: Board, ids: np.ndarray, pixels: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    clear = 0.5 if board.marker is None else (1 - board.marker / board.square) / 2
+    return refine_saddles(picture, weight, pixels, local_squares(board, ids, pixels), clear)
+
+
+def _with_neighbours(board: Board, known: dict[int, tuple[np.ndarray, float]], shape: tuple[int, ...]) -> _Seen:
+    """Known corners and those beside them, where the nearest known ones lead to."""
+    columns, rows = board.grid
+    ids = np.array(sorted(known))
+    pixels = np.stack([known[i][0] for i in ids])
+    across = local_squares(board, ids, pixels)
+    guesses: dict[int, list[np.ndarray]] = {}
+    for i, place, (right, down) in zip(ids, pixels, across.transpose(0, 2, 1), strict=True):
+        row, column = divmod(int(i), columns)
+        for dr, dc in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            other = (row + dr) * columns + column + dc
+            if 0 <= row + dr < rows and 0 <= column + dc < columns and other not in known:
+                guesses.setdefault(other, []).append(place + dc * right + dr * down)
+    new = {i: np.mean(several, axis=0) for i, several in guesses.items()}
+    new = {i: p for i, p in new.items() if 1 <= p[0] < shape[1] - 2 and 1 <= p[1] < shape[0] - 2}
+    everything = {**{i: known[i][0] for i in known}, **new}
+    order = sorted(everything)
+    return np.array(order), np.stack([everything[i] for i in order])
 
 
 def local_squares(board: Board, ids: np.ndarray, pixels: np.ndarray) -> np.ndarray:
