@@ -12,6 +12,7 @@ What a command does is one call:
 * ``mmsynth calibrate-noise``: ``calibrate_noise``.
 * ``mmsynth mesh``: ``mesh_to_file``. ``extract_mesh`` and ``write_mesh``: in memory, then to a file.
 * ``mmsynth export``: ``export_scene``.
+* ``mmsynth pose``: ``pose_scene``.
 * ``mmsynth batch``: ``run_batch``.
 
 A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. A ``Recipe`` holds every number of a fit. Bad input raises
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from mmsynth.workflows.batch import run_batch
     from mmsynth.workflows.calibrate import calibrate_rig
     from mmsynth.workflows.fit import evaluate_run, fit_run
+    from mmsynth.workflows.pose import pose_scene
     from mmsynth.workflows.runs import Run, open_run
 
 _NAMES = {
@@ -75,6 +77,7 @@ _NAMES = {
     "workflows.batch": "run_batch",
     "workflows.calibrate": "calibrate_rig",
     "workflows.fit": "evaluate_run fit_run",
+    "workflows.pose": "pose_scene",
     "workflows.runs": "Run open_run",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
@@ -82,7 +85,7 @@ _HOMES = {name: module for module, names in _NAMES.items() for name in names.spl
 __all__ = [
     "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise",
     "calibrate_rig", "convert", "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "export_scene", "extract_mesh",
-    "fit", "fit_run", "generate_dataset", "load_recipe", "load_scene", "mesh_to_file", "open_run", "run_batch", "simulate",
+    "fit", "fit_run", "generate_dataset", "load_recipe", "load_scene", "mesh_to_file", "open_run", "pose_scene", "run_batch", "simulate",
     "verify_dataset", "write_mesh",
 ]  # fmt: skip
 

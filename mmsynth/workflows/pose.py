@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from mmsynth.report.pose import write_pose_report
@@ -75,6 +76,20 @@ def pose_facts(posed: PosedCapture) -> dict[str, Any]:
         "unit_from": posed.unit_from,
         "notes": list(posed.notes),
         "left_out": [{"sensor": sensor, "view": view, "why": why} for (sensor, view), why in posed.lost.items()],
-        "rig_moved": {},
+        "rig_moved": _rig_moved(posed),
         "sensors": sensors,
     }
+
+
+def _rig_moved(posed: PosedCapture) -> dict[str, dict[str, float]]:
+    """How far sensors are from their calibrated places on the rig: metres and degrees; those that stayed are left out."""
+    out = {}
+    for captured in posed.capture.sensors:
+        place = posed.structure.places.get(captured.sensor.name)
+        if place is None or captured.camera_to_reference is None:
+            continue
+        motion = np.linalg.inv(captured.camera_to_reference) @ place
+        length, degrees = float(np.linalg.norm(motion[:3, 3])), float(np.degrees(np.linalg.norm(cv2.Rodrigues(motion[:3, :3])[0])))
+        if length > 1e-9 or degrees > 1e-7:
+            out[captured.sensor.name] = {"length": length, "degrees": degrees}
+    return out

@@ -6,6 +6,7 @@ one thread, and what runs in two is done picture by picture: the same pictures g
 
 from __future__ import annotations
 
+import copy
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from mmsynth.errors import InputError
 from mmsynth.scene.capture.matching import WELL_SEEN, Links, Picture, Shot, load_pycolmap, match_pictures
 from mmsynth.sensors.camera import Camera, project
 
+_WORTH = 0.95  # of the median error: a rig that was refined is taken below it
 _FEW = 50  # points in a picture that shows no texture
 
 
@@ -75,7 +77,9 @@ def reconstruct(
     if not models:
         raise InputError(f"{where}: {_why_no_start(pycolmap, database, links)}")
     best = models[0]
-    _finish(pycolmap, best, pictures)
+    _adjust(pycolmap, best, pictures)
+    if rig is not None and len(rig) > 1:
+        best = _with_rig_refined(pycolmap, best, pictures, rig)
     found = _structure(best, pictures, {} if rig is None else rig)
     lost, notes = _left_out(found.registered, pictures, models, counts, links, where)
     return replace(found, lost=lost, notes=(*notes, *_weak(pycolmap, database)))
@@ -126,7 +130,31 @@ def _map(pycolmap: Any, database: Path, folder: Path, work: Path, pictures: Sequ
     return best
 
 
-def _finish(pycolmap: Any, model: Any, pictures: Sequence[Picture]) -> None:
+def _with_rig_refined(pycolmap: Any, model: Any, pictures: Sequence[Picture], rig: Mapping[str, np.ndarray]) -> Any:
+    """The model with the sensors' places on the rig adjusted, too, if that is worth it; lengths stay those of the rig's baselines."""
+    refined = copy.deepcopy(model)
+    _adjust(pycolmap, refined, pictures, rig=True)
+    errors = [np.median([point.error for point in each.points3D.values()]) for each in (model, refined)]
+    if errors[1] > _WORTH * errors[0]:
+        return model
+    places = _places(refined, pictures)
+    stated = np.array([np.linalg.norm(rig[name][:3, 3]) for name in places])
+    found = np.array([np.linalg.norm(place[:3, 3]) for place in places.values()])
+    if stated @ found > 0:
+        refined.transform(pycolmap.Sim3d(scale=float(stated @ stated / (stated @ found))))
+    return refined
+
+
+def _places(model: Any, pictures: Sequence[Picture]) -> dict[str, np.ndarray]:
+    """(4, 4) camera to reference of every sensor that shares an instant with the reference."""
+    shots = {picture.file: picture.shot for picture in pictures}
+    seen = {shots[image.name]: image.cam_from_world().matrix() for image in model.images.values() if image.has_pose}
+    to_camera = {shot: np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]]) for shot, matrix in seen.items()}
+    reference = pictures[0].sensor
+    return {s: to_camera[reference, v] @ np.linalg.inv(m) for (s, v), m in to_camera.items() if (reference, v) in to_camera}
+
+
+def _adjust(pycolmap: Any, model: Any, pictures: Sequence[Picture], rig: bool = False) -> None:
     """One robust adjustment of everything, with the principal points of cameras that many pictures are of.
 
     Mapping takes every match within four pixels at its word. With Cauchy's loss, as wide as the median error, those that are off count
@@ -138,7 +166,7 @@ def _finish(pycolmap: Any, model: Any, pictures: Sequence[Picture]) -> None:
         of_camera[image.camera_id] += image.has_pose
     centred = not known and min(count for count in of_camera.values() if count) >= WELL_SEEN
     options = pycolmap.BundleAdjustmentOptions(
-        refine_focal_length=not known, refine_extra_params=not known, refine_principal_point=centred, refine_sensor_from_rig=False,
+        refine_focal_length=not known, refine_extra_params=not known, refine_principal_point=centred, refine_sensor_from_rig=rig,
         print_summary=False,
     )  # fmt: skip
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -146,6 +174,7 @@ def _finish(pycolmap: Any, model: Any, pictures: Sequence[Picture]) -> None:
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = 1e-6
     pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
 
 
 # --- what was found
@@ -183,7 +212,8 @@ def _structure(model: Any, pictures: Sequence[Picture], rig: Mapping[str, np.nda
     registered = dict(sorted(registered.items(), key=lambda item: order[item[0]]))
     points = [model.points3D[number] for number in sorted(model.points3D)]
     positions = np.array([point.xyz for point in points]).reshape(-1, 3)
-    return Structure(registered, {}, positions, np.array([point.error for point in points]), dict(rig), (), model)
+    places = {**rig, **_places(model, pictures)} if rig else {}
+    return Structure(registered, {}, positions, np.array([point.error for point in points]), places, (), model)
 
 
 def _left_out(

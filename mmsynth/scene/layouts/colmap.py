@@ -59,7 +59,7 @@ def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Pat
     names = {source: _sensor_name(source, sources, first[source]) for source in sources}
     wanted = wanted_modalities(names.values(), modalities, taken.folder)
     if len(sources) > 1:
-        problems.append(f"the folders {', '.join(sources)} in the names of {taken.folder} are taken as sensors of a rig.")
+        problems.append(f"the folders {', '.join(sources)} in the names of its images are taken as sensors of a rig.")
     order = sorted({view for _, view in groups.values()})
     ids = {view: index for index, view in enumerate(order)}
     sensors: dict[str, Sensor] = {}
@@ -175,25 +175,31 @@ def _best_model(root: Path, images: Path | None) -> tuple[_Fitting, list[str]]:
     if not found:
         raise InputError(next(iter(refused.values())))
     best = max(found, key=lambda fitting: (len(fitting.files), not fitting.resized))
-    problems = [f"{best.folder} is read, and not {folder}: {text}" for folder, text in refused.items()]
-    others = [f"{fitting.folder} ({len(fitting.files)})" for fitting in found if fitting is not best]
+    name = _within(best.folder, root)
+    problems = [f"{name} is read, and not {_within(folder, root)}: {text}" for folder, text in refused.items()]
+    others = [f"{_within(fitting.folder, root)} ({len(fitting.files)})" for fitting in found if fitting is not best]
     if others:
-        problems.append(f"{best.folder} is read, the model of {len(best.files)} pictures; there are others: {', '.join(others)}.")
+        problems.append(f"{name} is read, the model of {len(best.files)} pictures; there are others: {', '.join(others)}.")
     missing = len(best.listed) - len(best.files) - len(best.misfits)
     if missing:
-        problems.append(f"{missing} of {len(best.listed)} images of {best.folder} have no file and are left out.")
+        problems.append(f"{missing} of {len(best.listed)} images of {name} have no file and are left out.")
     if best.misfits:
         problems.append(f"{len(best.misfits)} pictures do not fit their cameras and are left out, the first: {best.misfits[0]}")
     strangers = _not_in_model(best)
     if strangers:
-        problems.append(f"{len(strangers)} pictures are not in {best.folder} and are left out, the first is {strangers[0].name}.")
+        problems.append(f"{len(strangers)} pictures are not in {name} and are left out, the first is {strangers[0].name}.")
     return best, problems + best.resized
+
+
+def _within(folder: Path, root: Path) -> str:
+    """The model as it is called in notes."""
+    return "the model" if folder == root else folder.relative_to(root).as_posix()
 
 
 def _fitting(folder: Path, root: Path, images: Path | None) -> _Fitting:
     listed = read_model(folder)
     files = _files(listed, folder, root, images)
-    resizes = Resizes(str(folder))
+    resizes = Resizes(_within(folder, root))
     cameras: dict[str, Camera] = {}
     misfits: list[str] = []
     for image in listed:

@@ -23,6 +23,7 @@ from mmsynth.scene.layouts.calibration import RigSensor, write_calibration
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame
 from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.workflows.pose import pose_facts
 
 CAMERA = Camera(320, 240, 330.0, 331.0, 158.0, 121.0, (-0.08, 0.03, 0.0005, -0.0004))
 Plane = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # origin, two edges, texture
@@ -141,27 +142,33 @@ def test_the_same_pictures_give_the_same_poses(photos: tuple[Path, list[np.ndarr
         np.testing.assert_array_equal(again.structure.registered[shot].camera_to_world, registered.camera_to_world)
 
 
-def test_a_rig_of_a_mosaic_and_a_mono_sensor_is_posed_in_metres(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bent", [0.0, 0.3], ids=["as calibrated", "bent by 0.3 degrees"])
+def test_a_rig_of_a_mosaic_and_a_mono_sensor_is_posed_in_metres(tmp_path: Path, bent: float) -> None:
     pytest.importorskip("pycolmap")
     place = np.eye(4)
     place[:3, :3], place[:3, 3] = Rotation.from_rotvec([0.01, -0.03, 0.02]).as_matrix(), [0.12, 0.01, -0.02]
     other = Camera(300, 240, 300.0, 300.5, 150.0, 118.0, (-0.1, 0.04, 0.0, 0.0))
+    stated = place.copy()
+    stated[:3, :3] = place[:3, :3] @ Rotation.from_rotvec([np.radians(bent), 0.0, 0.0]).as_matrix()
     poses, gain = _arc(6), np.array([[0.9, 0.5], [0.35, 0.9]])
     for i, pose in enumerate(poses):
         colour = _draw(CAMERA, pose, [FLOOR, *TENT]) ** 2 * np.tile(gain, (120, 160))
         _write(tmp_path / "modalities" / "rgb" / f"{i:04d}.png", np.round(65535 * colour).astype(np.uint16))
         grey = _draw(other, pose @ place, [FLOOR, *TENT]) ** 2
         _write(tmp_path / "modalities" / "mono" / f"{i:04d}.png", np.round(65535 * grey).astype(np.uint16))
-    rig = {"rgb": RigSensor(CAMERA, np.eye(4), {"mosaick_pattern": [[1, 2], [0, 1]]}), "mono": RigSensor(other, place)}
+    rig = {"rgb": RigSensor(CAMERA, np.eye(4), {"mosaick_pattern": [[1, 2], [0, 1]]}), "mono": RigSensor(other, stated)}
     write_calibration(tmp_path / "calibration.json", rig)
     posed = pose_capture(read_capture(tmp_path))
     assert posed.unit == "m" and len(posed.structure.registered) == 12
     off, turned, scale = _apart(posed, lambda name, view: poses[view] @ (place if name == "mono" else np.eye(4)), scale_free=False)
     assert scale == pytest.approx(1.0, abs=0.005)
     assert np.median(off) < 0.005 and np.median(turned) < 0.2
+    moved = pose_facts(posed)["rig_moved"]
+    assert not moved if bent == 0 else moved["mono"]["degrees"] == pytest.approx(bent, abs=0.1)
     for view in range(6):  # one pose for each instant
         shots = posed.structure.registered
-        np.testing.assert_allclose(shots["rgb", view].camera_to_world @ place, shots["mono", view].camera_to_world, atol=1e-9)
+        found = posed.structure.places["mono"]
+        np.testing.assert_allclose(shots["rgb", view].camera_to_world @ found, shots["mono", view].camera_to_world, atol=1e-9)
         np.testing.assert_array_equal(shots["rgb", view].camera.coefficients, CAMERA.coefficients)
 
 
