@@ -31,6 +31,7 @@ _FOCAL = np.geomspace(0.25, 6.0, 28)  # of the longer side: fields of view from 
 _FOLDS = 3
 _OUTLIER = 4.0  # standard deviations at which the error of a held-out corner stops to count
 _WORTH = 0.005  # of the squared error that more coefficients must take away
+_WIDE = 35.0  # degrees off axis from which a lens may well be a fisheye
 _AHEAD = 0.1  # cosine of the angle off axis up to which rays lead forward
 _TRIALS = 12  # boards that a focal length is tried on
 
@@ -77,15 +78,25 @@ def calibrate_alone(size: tuple[int, int], views: Sequence[View]) -> Alone | Non
     errors = {name: _held_out(adjusted, views) for name, adjusted in fits.items()}
     sigma = min(adjusted.sigma[0] for adjusted in fits.values())
     capped = {name: np.minimum((error**2).sum(1), 2 * (_OUTLIER * sigma) ** 2) for name, error in errors.items()}
-    chosen = next(iter(fits))
-    for name in (name for name in MODELS if name in fits):
+    order = [name for name in MODELS if name in fits]
+    wide = "fisheye" in fits and _widest(fits["fisheye"].state.cameras[0], views) > _WIDE
+    if wide:
+        order.sort(key=("pinhole", "brown4", "fisheye", "brown5", "brown8").index)
+    chosen = order[0]
+    for name in order:
         gain = capped[chosen] - capped[name]
-        # a fisheye has no decentring: where Brown's lens does nearly as well, the principal point would pay for that
-        worth = {"fisheye": 0.1, "brown8": 0.03}.get(name, _WORTH)
+        # a fisheye has no decentring: where a narrow Brown lens does nearly as well, the principal point would pay for that
+        worth = {"fisheye": _WORTH if wide else 0.1, "brown8": 0.03}.get(name, _WORTH)
         if gain.mean() > max(2 * gain.std() / np.sqrt(len(gain)), worth * capped[chosen].mean()):
             chosen = name
     scores = {name: float(np.sqrt(np.median(square) / np.log(4))) for name, square in ((n, (e**2).sum(1)) for n, e in errors.items())}
     return Alone(chosen, fits[chosen], scores)
+
+
+def _widest(camera: Camera, views: Sequence[View]) -> float:
+    """Degrees off axis of the farthest corner, of a fisheye."""
+    pixels = np.concatenate([view.pixels for view in views])
+    return float(np.degrees(np.linalg.norm((pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], axis=1).max()))
 
 
 def board_pose(camera: Camera, view: View) -> np.ndarray | None:

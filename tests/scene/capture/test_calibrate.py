@@ -60,7 +60,7 @@ def test_one_sensor_is_as_good_as_opencv() -> None:
 def test_the_model_is_chosen_by_held_out_corners(name: str) -> None:
     sensor = five_sensors()[name]
     rig = {name: sensor}
-    poses = board_poses(10, seed=4, distance=0.5 if name != "ms" else 0.3)
+    poses = board_poses(20, seed=4, distance=0.5 if name != "ms" else 0.22)  # a fisheye shows at wide angles alone
     frames = seen_corners(rig, {name: [sensor.camera_to_reference @ pose for pose in poses]}, BOARD, NOISE)
     found = [several[0] for several in frames[name].found.values() if several]
     views = [View(0, i, corner_points(BOARD)[d.ids], d.pixels) for i, d in enumerate(found)]
