@@ -173,7 +173,11 @@ def _adjust(pycolmap: Any, model: Any, pictures: Sequence[Picture], rig: bool = 
     options.ceres.loss_function_scale = float(np.median([point.error for point in model.points3D.values()]))
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = 1e-6
-    pycolmap.bundle_adjustment(model, options)
+    everything = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        everything.add_image(image)
+    everything.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, everything, model).solve()  # pycolmap.bundle_adjustment, without its log
     model.update_point_3d_errors()
 
 
