@@ -239,7 +239,7 @@ def write_run_report(
     view, rows = picture_rows(field, scene) if scene is not None else (None, [])
     columns, scores = _score_table(evaluation or {})
     needs = manifest.get("needs", {})
-    name = scene.root.name if scene is not None else run_dir.name
+    name = scene.root.resolve().name if scene is not None else run_dir.name
     region = field.region
     centre = ", ".join(f"{c:.4g}" for c in region.centre)
     facts = _flat({key: manifest[key] for key in _RUN_FACTS if key in manifest})

@@ -42,12 +42,11 @@ class _SceneFile(BaseModel):
 
 
 def stated_source(path: Path, layout: str | None, images: Path | str | None, also: Mapping[str, str] | None) -> SceneSource:
-    """What is asked for, and what ``scene.toml`` adds to it; every path is absolute.
+    """What is asked for, and what ``scene.toml`` adds to it; ``path`` as it is given, the others absolute.
 
     Raises:
         InputError: no such file or folder, a bad ``scene.toml``, no such layout, or a folder of pictures that is not there.
     """
-    path = path.resolve()
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
     path = path.parent if path.name == "scene.toml" else path

@@ -158,7 +158,7 @@ def make_split(views: Iterable[int], test: Iterable[int] = (), source: str = "")
 
 @dataclass(frozen=True)
 class SceneSource:
-    """All that it takes to read a scene again, as ``load_scene`` takes it and ``scene.toml`` adds to it; paths are absolute.
+    """All that it takes to read a scene again, as ``load_scene`` takes it and ``scene.toml`` adds to it; folders of pictures are absolute.
 
     Attributes:
         path: the folder or file.

@@ -47,8 +47,8 @@ def posed_from_json(stated: Mapping[str, Any]) -> PosedCamera:
 
 def source_to_json(scene: Scene) -> dict[str, Any]:
     """Where a scene is and how it was read, for ``load.load_again``."""
-    source = scene.source or SceneSource(scene.root.resolve())
-    stated: dict[str, Any] = {"path": str(source.path), "format": scene.format, "masks": scene.masks}
+    source = scene.source or SceneSource(scene.root)
+    stated: dict[str, Any] = {"path": str(source.path.resolve()), "format": scene.format, "masks": scene.masks}
     if scene.mask_folder is not None:
         stated["mask_folder"] = str(scene.mask_folder.resolve())
     if source.images is not None:
