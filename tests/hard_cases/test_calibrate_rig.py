@@ -95,6 +95,19 @@ def test_a_sensor_that_sees_no_board_with_the_reference(row: Row) -> None:
     )
 
 
+def test_a_board_of_which_one_line_of_corners_is_seen(row: Row) -> None:
+    rig = {name: sensor for name, sensor in five_sensors().items() if name in ("rgb", "nir")}
+    frames = seen_corners(rig, dict.fromkeys(rig, board_poses(12)))
+    for sensor in frames.values():
+        one = sensor.found["003"][0]
+        line = one.ids % BOARD.grid[0] == 1
+        sensor.found["003"] = [replace(one, ids=one.ids[line], pixels=one.pixels[line], deviation=one.deviation[line])]
+    ours = calibrate_found(frames, [BOARD], "boards").rig["nir"].camera_to_reference
+    error = np.linalg.norm(ours - rig["nir"].camera_to_reference)
+    assert error < 3e-3
+    row("a board of which one line of corners is seen", "solvePnP: NaN, and all that is solved with it", f"{1000 * error:.2f} mm")
+
+
 def test_pictures_of_a_mirror(tmp_path: Path, row: Row) -> None:
     camera = Camera(320, 240, 340.0, 340.0, 160.0, 119.0)
     (tmp_path / "mono").mkdir()

@@ -33,12 +33,14 @@ class View:
     Attributes:
         sensor, pose: rows of the rig's cameras and of its boards' poses.
         points: (N, 3) metres, on the board. pixels: (N, 2).
+        spread: (N,) standard deviations of the pixels, relative to that of a usual corner of the sensor.
     """
 
     sensor: int
     pose: int
     points: np.ndarray
     pixels: np.ndarray
+    spread: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Adjusted:
 
     Attributes:
         residuals: (N, 2) px of each view, measured minus modelled.
-        sigma: (S,) px, standard deviation of a coordinate of each sensor's corners.
+        sigma: (S,) px, standard deviation of a coordinate of each sensor's usual corners (spread 1).
         covariance: (C, C) of the sensors' parameters: of each sensor its free intrinsics, and but for the reference its motion (rotation
             vector [rad] and translation [m] in the sensor's axes, applied after ``to_sensor``). NaN where they are not determined.
         starts: (S,) where the parameters of each sensor begin in it.
@@ -134,17 +136,20 @@ class _Problem:
         self.pose = np.concatenate([np.full(len(view.points), view.pose) for view in views])
         self.points = np.concatenate([view.points for view in views])
         self.pixels = np.concatenate([view.pixels for view in views])
+        self.spread = np.concatenate([view.spread for view in views])
         self.rows = [np.flatnonzero(self.sensor == s) for s in range(len(state.cameras))]
         sizes = [len(free) + (6 if s else 0) for s, free in enumerate(state.free)]
         self.starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
         self.count = int(sum(sizes))
 
     def residuals(self, state: RigState) -> np.ndarray:
-        """(N, 2) px; infinite where a point has no pixel."""
+        """(N, 2) px; where a point has no pixel, as long as the picture: a board that went behind the camera is off, and named as such."""
         out = np.empty((len(self.points), 2))
         for s, rows in enumerate(self.rows):
-            seen = project_with_derivatives(self._local(state, s), state.cameras[s])[0]
-            out[rows] = self.pixels[rows] - np.where(np.isfinite(seen), seen, np.inf)
+            camera = state.cameras[s]
+            apart = self.pixels[rows] - project_with_derivatives(self._local(state, s), camera)[0]
+            lost = ~np.isfinite(apart).all(1, keepdims=True)
+            out[rows] = np.where(lost, float(np.hypot(camera.width, camera.height)), apart)
         return out
 
     def _local(self, state: RigState, s: int) -> np.ndarray:
@@ -156,7 +161,7 @@ class _Problem:
         """(S,) px, of a coordinate: by the median of the lengths, or by the squares within what the loss takes as they are."""
         out = np.empty(len(self.rows))
         for s, rows in enumerate(self.rows):
-            length = np.linalg.norm(residuals[rows], axis=1)
+            length = np.linalg.norm(residuals[rows], axis=1) / self.spread[rows]
             out[s] = max(float(np.median(length[np.isfinite(length)], axis=0)) / _MEDIAN if np.isfinite(length).any() else 1.0, _FLOOR)
             if not robust:
                 kept = length[length < 4 * out[s]]
@@ -172,7 +177,7 @@ class _Problem:
     def cost(self, residuals: np.ndarray, sigma: np.ndarray, loss: Loss) -> float:
         if not np.isfinite(residuals).all():
             return float("inf")
-        q = (residuals**2).sum(1) / sigma[self.sensor] ** 2
+        q = (residuals**2).sum(1) / (sigma[self.sensor] * self.spread) ** 2
         if loss == "cauchy":
             return float((_CAUCHY**2 * np.log1p(q / _CAUCHY**2)).sum())
         return float(np.where(q < _HUBER**2, q, 2 * _HUBER * np.sqrt(q) - _HUBER**2).sum())
@@ -186,8 +191,12 @@ class _Problem:
         for s, rows in enumerate(self.rows):
             pose, local = self.pose[rows], self._local(state, s)
             seen, by_point, by_camera = project_with_derivatives(local, state.cameras[s])
+            lost = ~np.isfinite(seen).all(1)  # nothing says where to
+            seen, by_point, by_camera = seen.copy(), by_point.copy(), by_camera.copy()
+            seen[lost], by_point[lost], by_camera[lost] = self.pixels[rows][lost], 0.0, 0.0
             error = self.pixels[rows] - seen
-            weight = _trust((error**2).sum(1) / sigma[s] ** 2, loss) / sigma[s] ** 2
+            variance = (sigma[s] * self.spread[rows]) ** 2
+            weight = _trust((error**2).sum(1) / variance, loss) / variance
             turn = state.to_sensor[s, :3, :3] @ state.boards[:, :3, :3]
             on_board = np.concatenate([-_cross(self.points[rows]), np.broadcast_to(np.eye(3), (len(rows), 3, 3))], 2)
             by_board = by_point @ turn[pose] @ on_board

@@ -18,8 +18,10 @@ from mmsynth.scene.capture import diagnosis
 from mmsynth.scene.capture.adjustment import Adjusted, RigState, View, adjust, inverse
 from mmsynth.scene.capture.board import Board, corner_points
 from mmsynth.scene.capture.board_frames import SensorFrames, find_in_frames, list_frames
-from mmsynth.scene.capture.lens_choice import MODELS, Alone, board_pose, calibrate_alone, errors_of
-from mmsynth.scene.capture.topology import Key, Placed, place_sensors, relabelled
+from mmsynth.scene.capture.detection import Detection
+from mmsynth.scene.capture.expected import find_where_expected
+from mmsynth.scene.capture.lens_choice import MODELS, Alone, board_pose, calibrate_alone, errors_of, plain_camera
+from mmsynth.scene.capture.topology import Key, place_sensors, relabelled
 from mmsynth.scene.layouts.calibration import Rig, RigSensor
 from mmsynth.scene.scene import canonical_modality
 from mmsynth.sensors.camera import COEFFICIENTS, Camera
@@ -27,6 +29,8 @@ from mmsynth.sensors.camera import COEFFICIENTS, Camera
 LEAST_BOARDS = 4
 _BAD_BOARD, _BAD_SCALE = 3.0, 5.0  # medians of the boards' rms, and standard deviations, beyond which a board is left out
 _BAD_CORNER = 5.0  # standard deviations of a corner's two coordinates
+_LEAST_DEVIATION = 0.002  # px
+_VAGUE, _ENOUGH = 4.0, 6  # spread of a corner that says nothing where there are enough others
 _ROUNDS = 4  # of leaving out and adjusting again
 
 
@@ -116,6 +120,7 @@ class _Sight:
     key: Key
     ids: np.ndarray
     pixels: np.ndarray
+    spread: np.ndarray
 
 
 def calibrate(
@@ -147,15 +152,20 @@ def calibrate(
     for name in order:
         sensors[name] = find_in_frames(sensors[name], boards, count, progress, done, total)
         done += len(sensors[name].files)
-    return calibrate_found({name: sensors[name] for name in order}, boards, str(folder))
+    return calibrate_found({name: sensors[name] for name in order}, boards, str(folder), count)
 
 
-def calibrate_found(sensors: Mapping[str, SensorFrames], boards: Sequence[Board], where: str) -> Calibration:
-    """``calibrate`` from boards that were found already; the first sensor is the reference, ``where`` begins its errors."""
+def calibrate_found(sensors: Mapping[str, SensorFrames], boards: Sequence[Board], where: str, look_again: int = 0) -> Calibration:
+    """``calibrate`` from boards that were found already; the first sensor is the reference.
+
+    Args:
+        where: begins errors. look_again: frames that are looked at once more at a time, for boards that other sensors see; 0: none.
+    """
     diagnosis.check_same_files(sensors, where)
     left_out = _frames_without(sensors)
+    usual = {name: _usual_deviation(sensor) for name, sensor in sensors.items()}
     sights = [
-        _Sight(name, (instant, found.board), found.ids, found.pixels)
+        _sight(name, instant, found, usual[name])
         for name, sensor in sensors.items()
         for instant, several in sensor.found.items()
         for found in several
@@ -190,13 +200,49 @@ def calibrate_found(sensors: Mapping[str, SensorFrames], boards: Sequence[Board]
         for sight in sights
     ]
     names = list(sensors)
-    sights, keys, adjusted, dropped = _adjust_rig(names, alone, placed, sights, boards, where)
+    state = RigState(
+        tuple(alone[name].adjusted.state.cameras[0] for name in names),
+        tuple(np.array([0, 1, 2, 3, *(4 + k for k in MODELS[alone[name].model][1])]) for name in names),
+        np.stack([inverse(placed.to_reference[name]) for name in names]),
+        np.zeros((0, 4, 4)),
+    )
+    sights, keys, adjusted, dropped = _adjust_rig(names, state, placed.boards, sights, boards, where)
     left_out += dropped
+    if look_again and len(names) > 1:
+        places = dict(zip(keys, adjusted.state.boards, strict=True))
+        known = {(s.sensor, s.key) for s in sights} | {(out.sensor, (out.instant, out.board)) for out in left_out if out.board is not None}
+        more = [
+            _sight(name, str(key[0]), found, usual[name])
+            for s, name in enumerate(names)
+            for key, found in find_where_expected(
+                sensors[name], s, adjusted.state, places, boards, {key for of, key in known if of == name}, look_again
+            ).items()
+        ]
+        if more:
+            sights, keys, adjusted, dropped = _adjust_rig(names, adjusted.state, places, [*sights, *more], boards, where)
+            frames = {(sight.sensor, str(sight.key[0])) for sight in more}
+            left_out = [out for out in left_out if out.board is not None or (out.sensor, out.instant) not in frames] + dropped
     return _result(sensors, alone, sights, keys, adjusted, left_out, boards, where)
 
 
 def _view(sight: _Sight, sensor: int, pose: int, boards: Sequence[Board]) -> View:
-    return View(sensor, pose, corner_points(boards[sight.key[1]])[sight.ids], sight.pixels)
+    return View(sensor, pose, corner_points(boards[sight.key[1]])[sight.ids], sight.pixels, sight.spread)
+
+
+def _sight(name: str, instant: str, found: Detection, usual: float) -> _Sight:
+    """A corner's error has two parts of one size where it is a usual one: what the pixels' scatter says of it, and what it does not."""
+    known = np.where(np.isfinite(found.deviation), found.deviation, usual)
+    spread = np.sqrt((1 + (known / usual) ** 2) / 2)
+    clear = spread < _VAGUE if (spread < _VAGUE).sum() >= _ENOUGH else np.isfinite(spread)
+    return _Sight(name, (instant, found.board), found.ids[clear], found.pixels[clear], spread[clear])
+
+
+def _usual_deviation(sensor: SensorFrames) -> float:
+    """Median px of the corners' deviations, by the pixels' scatter."""
+    each = [found.deviation for several in sensor.found.values() for found in several]
+    known = np.concatenate([np.zeros(0), *each])
+    known = known[np.isfinite(known)]
+    return max(float(np.median(known)), _LEAST_DEVIATION) if len(known) else 1.0
 
 
 def _frames_without(sensors: Mapping[str, SensorFrames]) -> list[LeftOut]:
@@ -219,8 +265,13 @@ def _too_few(name: str, sensor: SensorFrames, count: int, boards: Sequence[Board
 
 
 def _bad_boards(alone: Alone, sights: Sequence[_Sight]) -> dict[int, str]:
-    """Rows of boards that disagree with the others of their own sensor."""
-    rms = np.array([np.sqrt((r**2).sum(1).mean()) for r in alone.adjusted.residuals])
+    """Rows of boards most of whose corners disagree with the others of their own sensor."""
+    rms = np.array(
+        [
+            np.sqrt(np.median(((r / s.spread[:, None]) ** 2).sum(1)) / np.log(2))
+            for r, s in zip(alone.adjusted.residuals, sights, strict=True)
+        ]
+    )
     typical, sigma = float(np.median(rms)), float(alone.adjusted.sigma[0])
     limit = max(_BAD_BOARD * typical, 1.4 * min(_BAD_SCALE * sigma, _BAD_SCALE * typical))
     return {
@@ -231,22 +282,18 @@ def _bad_boards(alone: Alone, sights: Sequence[_Sight]) -> dict[int, str]:
 
 
 def _adjust_rig(
-    names: Sequence[str], alone: Mapping[str, Alone], placed: Placed, sights: Sequence[_Sight], boards: Sequence[Board], where: str
+    names: Sequence[str], state: RigState, poses: Mapping[Key, np.ndarray], sights: Sequence[_Sight], boards: Sequence[Board], where: str
 ) -> tuple[list[_Sight], list[Key], Adjusted, list[LeftOut]]:
-    """Adjust, leave out what does not fit, adjust again until nothing is left out."""
-    cameras = tuple(alone[name].adjusted.state.cameras[0] for name in names)
-    free = tuple(np.array([0, 1, 2, 3, *(4 + k for k in MODELS[alone[name].model][1])]) for name in names)
-    to_sensor = np.stack([inverse(placed.to_reference[name]) for name in names])
-    start = dict(placed.boards)
+    """Adjust, leave out what does not fit, adjust again until nothing is left out; ``state`` and ``poses`` are where it starts."""
+    start = dict(poses)
     left_out: list[LeftOut] = []
     sights = list(sights)
     for round_ in range(_ROUNDS):
         keys = sorted({sight.key for sight in sights}, key=str)
         row = {key: i for i, key in enumerate(keys)}
         views = [_view(sight, names.index(sight.sensor), row[sight.key], boards) for sight in sights]
-        state = RigState(cameras, free, to_sensor, np.stack([start[key] for key in keys]))
-        adjusted = adjust(state, views, "cauchy" if round_ == 0 else "huber")
-        cameras, to_sensor = adjusted.state.cameras, adjusted.state.to_sensor
+        adjusted = adjust(replace(state, boards=np.stack([start[key] for key in keys])), views, "cauchy" if round_ == 0 else "huber")
+        state = adjusted.state
         start.update(zip(keys, adjusted.state.boards, strict=True))
         if round_ == 0 and len(names) > 1:
             diagnosis.check_synchronous(names, [(s.sensor, s.key) for s in sights], views, adjusted, where)
@@ -256,11 +303,12 @@ def _adjust_rig(
         for sight, residuals, view in zip(sights, adjusted.residuals, views, strict=True):
             s = names.index(sight.sensor)
             length = np.linalg.norm(residuals, axis=1)
-            rms = float(np.sqrt((length**2).mean()))
-            good = length < _BAD_CORNER * adjusted.sigma[s] * 1.2
-            if rms > limits[s] or good.sum() < max(4, 0.5 * len(good)):
-                own = board_pose(cameras[s], view)
-                by_itself = float(np.sqrt((errors_of(cameras[s], view, own) ** 2).mean())) if own is not None else np.inf
+            even = length / sight.spread
+            good = even < _BAD_CORNER * adjusted.sigma[s] * 1.2
+            if good.sum() < max(4, 0.5 * len(good)) or np.sqrt((even[good] ** 2).mean()) > limits[s]:
+                rms = float(np.sqrt((length**2).mean()))
+                own = board_pose(state.cameras[s], view)
+                by_itself = float(np.sqrt((errors_of(state.cameras[s], view, own) ** 2).mean())) if own is not None else np.inf
                 why = f"its corners are off by {rms:.2f} px"
                 why += f", {by_itself:.2f} px by itself: not where the other sensors see it" if by_itself < 0.5 * rms else " even by itself"
                 left_out.append(LeftOut(sight.sensor, str(sight.key[0]), sight.key[1], why))
@@ -268,7 +316,7 @@ def _adjust_rig(
                 continue
             if not good.all():
                 changed = True
-            kept.append(sight if good.all() else replace(sight, ids=sight.ids[good], pixels=sight.pixels[good]))
+            kept.append(sight if good.all() else _part(sight, good))
         if not changed or round_ == _ROUNDS - 1:
             break
         sights = kept
@@ -281,9 +329,13 @@ def _adjust_rig(
     return sights, keys, adjusted, left_out
 
 
+def _part(sight: _Sight, keep: np.ndarray) -> _Sight:
+    return replace(sight, ids=sight.ids[keep], pixels=sight.pixels[keep], spread=sight.spread[keep])
+
+
 def _limits(names: Sequence[str], sights: Sequence[_Sight], adjusted: Adjusted) -> np.ndarray:
-    """(S,) px: the rms from which a board of a sensor is left out."""
-    rms = np.array([np.sqrt((r**2).sum(1).mean()) for r in adjusted.residuals])
+    """(S,) px: the rms, of corners brought to one spread, from which a board of a sensor is left out."""
+    rms = np.array([np.sqrt(((r / s.spread[:, None]) ** 2).sum(1).mean()) for r, s in zip(adjusted.residuals, sights, strict=True)])
     own = np.array([names.index(sight.sensor) for sight in sights])
     return np.array([max(_BAD_BOARD * float(np.median(rms[own == s])), 3 * adjusted.sigma[s]) for s in range(len(names))])
 
@@ -302,7 +354,7 @@ def _result(
     problems: list[str] = []
     for s, name in enumerate(names):
         own = [view for view in seen if view.sensor == name]
-        camera = _plain(adjusted.state.cameras[s], MODELS[alone[name].model][1])
+        camera = plain_camera(adjusted.state.cameras[s], MODELS[alone[name].model][1])
         place = inverse(adjusted.state.to_sensor[s]) if s else np.eye(4)
         rig[name] = RigSensor(camera, place, sensors[name].described, sensors[name].source_name)
         deviations = _deviations(adjusted, s, place, camera)
@@ -315,20 +367,6 @@ def _result(
         problems += diagnosis.problems_of(name, sensors[name], camera, results[name], own)
     poses = {key: pose for key, pose in zip(keys, adjusted.state.boards, strict=True)}
     return Calibration(rig, results, tuple(boards), tuple(seen), tuple(left_out), poses, tuple(problems))
-
-
-def _plain(camera: Camera, coefficients: tuple[int, ...]) -> Camera:
-    """As it is written: plain floats, no coefficients beyond those of the model."""
-    count = next(n for n in (0, 4, 5, 8) if len(coefficients) <= n)
-    distortion = tuple(float(value) for value in camera.coefficients[:count])
-    return replace(
-        camera,
-        fx=float(camera.fx),
-        fy=float(camera.fy),
-        cx=float(camera.cx),
-        cy=float(camera.cy),
-        distortion=distortion if any(distortion) else (),
-    )
 
 
 def _deviations(adjusted: Adjusted, s: int, place: np.ndarray, camera: Camera) -> dict[str, Any]:

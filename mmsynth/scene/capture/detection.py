@@ -51,8 +51,7 @@ def find_boards(raw: np.ndarray, boards: Sequence[Board], pattern: np.ndarray | 
         one for each board that is seen, with at least six corners. Of boards that look the same when turned (``turns``) the ids are those
         of one of their turns.
     """
-    tile = (1, 1) if pattern is None or raw.ndim == 3 else (pattern.shape[0], pattern.shape[1])
-    mosaic = np.asarray(raw, dtype=np.float32) if raw.ndim == 2 else _grey(raw)
+    mosaic, tile = _mosaic(raw, pattern)
     picture = level_channels(mosaic, tile)
     markers: dict[tuple[str, bool], Markers] = {}
     found: list[Detection] = []
@@ -70,6 +69,27 @@ def find_boards(raw: np.ndarray, boards: Sequence[Board], pattern: np.ndarray | 
         seen = [one for guess in guesses if (one := _refined(mosaic, picture, tile, index, board, *guess)) is not None]
         found += sorted(seen, key=lambda one: -len(one.ids))[:1]
     return found
+
+
+def find_expected(
+    raw: np.ndarray, expected: Sequence[tuple[int, Board, np.ndarray, np.ndarray]], pattern: np.ndarray | None = None
+) -> list[Detection]:
+    """``find_boards`` where boards are known to be: corners that no marker led to are found, too.
+
+    Args:
+        expected: (index, board, ids (N,), pixels (N, 2)) of each, to a pixel or two.
+    """
+    mosaic, tile = _mosaic(raw, pattern)
+    picture = level_channels(mosaic, tile)
+    seen = (_refined(mosaic, picture, tile, *one) for one in expected)
+    return [one for one in seen if one is not None]
+
+
+def _mosaic(raw: np.ndarray, pattern: np.ndarray | None) -> tuple[np.ndarray, tuple[int, int]]:
+    """One value for each pixel (H, W) float32, and the rows and columns after which they repeat."""
+    if raw.ndim == 3:
+        return _grey(raw), (1, 1)
+    return np.asarray(raw, dtype=np.float32), (1, 1) if pattern is None else (pattern.shape[0], pattern.shape[1])
 
 
 def level_channels(mosaic: np.ndarray, tile: tuple[int, int]) -> np.ndarray:
@@ -224,8 +244,16 @@ def _refined(
 def _saddles(
     picture: np.ndarray, weight: np.ndarray, board: Board, ids: np.ndarray, pixels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    clear = 0.5 if board.marker is None else (1 - board.marker / board.square) / 2
-    return refine_saddles(picture, weight, pixels, local_squares(board, ids, pixels), clear)
+    return refine_saddles(picture, weight, pixels, local_squares(board, ids, pixels), _marker_border(board))
+
+
+def _marker_border(board: Board) -> tuple[float, float] | None:
+    """How far from the edges of its square a marker's black border begins and ends, in squares."""
+    if board.marker is None:
+        return None
+    cells = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).markerSize + 2
+    begin = (1 - board.marker / board.square) / 2
+    return begin, begin + board.marker / board.square / cells
 
 
 def _with_neighbours(board: Board, known: dict[int, tuple[np.ndarray, float]], shape: tuple[int, ...]) -> _Seen:

@@ -93,6 +93,20 @@ def calibrate_alone(size: tuple[int, int], views: Sequence[View]) -> Alone | Non
     return Alone(chosen, fits[chosen], scores)
 
 
+def plain_camera(camera: Camera, coefficients: tuple[int, ...]) -> Camera:
+    """As it is written: plain floats, no coefficients beyond those of the model."""
+    count = next(n for n in (0, 4, 5, 8) if len(coefficients) <= n)
+    distortion = tuple(float(value) for value in camera.coefficients[:count])
+    return replace(
+        camera,
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(camera.cx),
+        cy=float(camera.cy),
+        distortion=distortion if any(distortion) else (),
+    )
+
+
 def _widest(camera: Camera, views: Sequence[View]) -> float:
     """Degrees off axis of the farthest corner, of a fisheye."""
     pixels = np.concatenate([view.pixels for view in views])
@@ -112,7 +126,7 @@ def board_pose(camera: Camera, view: View) -> np.ndarray | None:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turns[k])[0], np.ravel(shifts[k])
         size = float(np.median(np.minimum(errors_of(camera, view, pose), 1e9)))
-        if size < least:
+        if size < least and np.isfinite(pose).all():  # of corners on one line IPPE makes NaN
             best, least = pose, size
     return best
 
@@ -186,4 +200,4 @@ def _held_out(adjusted: Adjusted, views: Sequence[View]) -> np.ndarray:
 
 
 def _part(view: View, keep: np.ndarray) -> View:
-    return replace(view, points=view.points[keep], pixels=view.pixels[keep])
+    return replace(view, points=view.points[keep], pixels=view.pixels[keep], spread=view.spread[keep])

@@ -63,7 +63,7 @@ def test_the_model_is_chosen_by_held_out_corners(name: str) -> None:
     poses = board_poses(20, seed=4, distance=0.5 if name != "ms" else 0.22)  # a fisheye shows at wide angles alone
     frames = seen_corners(rig, {name: [sensor.camera_to_reference @ pose for pose in poses]}, BOARD, NOISE)
     found = [several[0] for several in frames[name].found.values() if several]
-    views = [View(0, i, corner_points(BOARD)[d.ids], d.pixels) for i, d in enumerate(found)]
+    views = [View(0, i, corner_points(BOARD)[d.ids], d.pixels, np.ones(len(d.ids))) for i, d in enumerate(found)]
     alone = calibrate_alone(frames[name].size, views)
     assert alone is not None and alone.model == {"rgb": "brown4", "mono": "pinhole", "ms": "fisheye"}[name]
     assert min(alone.scores, key=lambda model: alone.scores[model]) in (alone.model, "brown5", "brown8", "brown4", "fisheye")
