@@ -274,6 +274,7 @@ def test_simulate_is_a_scene_that_can_be_fitted_again(fitted: Path, tmp_path: Pa
 
 def test_bad_simulations_are_refused(fitted: Path) -> None:
     (fitted / "psf.toml").write_text(MONO_TOML.replace("nir", "rgb").replace("[noise]", "psf_sigma_px = 1.0\n[noise]"))
+    (fitted / "rgb.toml").write_text(MONO_TOML.replace("nir", "rgb"))
     (fitted / "key.toml").write_text(MONO_TOML.replace("read_e", "read_noise"))
     refused(here(fitted, "simulate", "--sensor", "psf.toml"), "one of --poses and --views")
     refused(here(fitted, "simulate", "--sensor", "psf.toml", "--views", "test"), "psf.toml", "psf_sigma_px", "--delta")
