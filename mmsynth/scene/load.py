@@ -169,8 +169,12 @@ def _richest(path: Path, held: Sequence[Layout], modalities: Sequence[str] | Non
     if not found:
         raise next(iter(refused.values()))
     taken = max(found, key=lambda name: len(found[name].frames))
-    others = [f"{name} with {len(scene.frames)}" for name, scene in found.items() if name != taken]
+    files = {frame.path for frame in found[taken].frames}
+    # the same pictures described twice, as ``mmsynth pose`` does, leave nothing to decide
+    others = [f"{name} with {len(s.frames)}" for name, s in found.items() if {frame.path for frame in s.frames} != files]
     others += [f"{name}, which cannot be read ({str(error).rstrip('.')})" for name, error in refused.items()]
+    if not others:
+        return found[taken]
     note = f"read as {taken}, {len(found[taken].frames)} pictures; the folder also holds {', '.join(others)}: --layout NAME decides."
     return dataclasses.replace(found[taken], problems=(note, *found[taken].problems))
 

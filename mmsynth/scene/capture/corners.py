@@ -22,6 +22,7 @@ _CLEAR = 1.5  # pixels by which the inside of a marker blurs into its black bord
 _BLUR = (-2.0, 1.5)  # logarithms of σ [px]
 _WITHIN = [np.array([i, j]) / 3 for i in (-1, 0, 1) for j in (-1, 0, 1)]  # places within a photosite, whose light it gathers
 _STEPS, _REST = 25, 1e-4  # of Gauss and Newton; px that a corner moves at the last of them
+_MISFIT = 0.3  # rms of what is not explained, relative to half the contrast of black and white
 _AWAY = 0.3  # of a square's shortest side [px] by which a corner may move, or two pixels
 
 
@@ -73,7 +74,7 @@ def refine_saddles(
     parameters, covariance, residual = _gauss_newton(parameters, x, value, mask, clear)
 
     moved = np.linalg.norm(parameters[:, :2] - pixels, axis=1)
-    good = (moved < np.maximum(2.0, _AWAY * side)) & (parameters[:, 6] * white > 0.3) & (residual < 0.4)
+    good = (moved < np.maximum(2.0, _AWAY * side)) & (parameters[:, 6] * white > 0.3) & (residual < _MISFIT * np.abs(parameters[:, 6]))
     good &= ~flat & ((mask > 0).sum(1) > 14) & (parameters[:, 4] < _BLUR[1])
     turned = np.sin(parameters[:, 3] - parameters[:, 2]) / np.sin(angle[:, 1] - angle[:, 0])
     good &= np.isfinite(moved) & (turned > 0.3)
@@ -102,6 +103,7 @@ def _gauss_newton(
         damped = hessian + (damping[active][:, None] * diagonal + 1e-9)[:, :, None] * np.eye(9)
         step = np.clip(np.linalg.solve(damped, gradient[..., None])[..., 0], -0.5, 0.5)
         tried = p[active] + step
+        tried[:, 4] = np.clip(tried[:, 4], *_BLUR)
         model_tried, jacobian_tried = _edges(tried, x[active], None if clear is None else clear[active])
         cost_tried = (mask[active] * (value[active] - model_tried) ** 2).sum(1)
         better = cost_tried < cost[active]
@@ -123,7 +125,7 @@ def _edges(p: np.ndarray, x: np.ndarray, clear: np.ndarray | None) -> tuple[np.n
     cos, sin = np.cos(p[:, 2:4]), np.sin(p[:, 2:4])
     normal = np.stack([cos, sin], -1)  # (N, 2, 2)
     tangent = np.stack([-sin, cos], -1)
-    blur = np.exp(np.clip(p[:, 4], *_BLUR))[:, None, None]
+    blur = np.exp(p[:, 4])[:, None, None]
     offset = x - p[:, None, :2]
     sign = np.sign(p[:, 6])[:, None]
     shape, by_log = np.zeros(x.shape[:2]), np.zeros(x.shape[:2])

@@ -2,8 +2,8 @@
 
 * Models are sought in ``sparse/0``, ``sparse``, ``dense/0/sparse``, ``dense/sparse``, ``colmap/sparse/0``, ``colmap/sparse``, ``colmap``
   and the folder itself; of several that to which most pictures belong is taken.
-* Pictures are in ``images/`` at the model or in a folder above it, or in these folders themselves. A model made at another size than the
-  files has its cameras scaled where both sides have one ratio; a picture of any other size does not belong to the model.
+* Pictures are in ``images/`` or ``modalities/`` at the model or in a folder above it, or in these folders themselves. A model made at
+  another size than the files has its cameras scaled where both sides have one ratio; a picture of any other size does not belong to it.
 * Names with subfolders are sensors of a rig, where ``frames`` say so, or where the folders hold the same names and the rotation from one
   to the other is the same at every name. Else all pictures are of one sensor, however many cameras it has.
 * Ids of views count the model's images (or instants) by name. The region of interest is that of the sparse points.
@@ -219,7 +219,7 @@ def _files(listed: Sequence[ModelImage], folder: Path, root: Path, images: Path 
         places = [Pictures(folder, images)]
     else:
         levels = [folder, *(parent for parent in folder.parents if parent.is_relative_to(root))]
-        places = [Pictures(place) for level in levels for place in (level / "images", level)]
+        places = [Pictures(place) for level in levels for place in (level / "images", level / "modalities", level)]
     best: dict[str, Path] = {}
     for place in places:
         there = {image.name: file for image in listed if (file := place.find(image.name)) is not None}
