@@ -120,7 +120,7 @@ def test_files_that_the_house_names() -> None:
 
 def test_set_up_blocks_as_ci_reads_them() -> None:
     text = README.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 130
+    assert len(text.splitlines()) <= 145
     marked = [(mark, language, block) for mark, language, block in BLOCK.findall(text) if mark]
     assert [mark for mark, _, _ in marked] == ["example", "tests"]
     for _, language, block in marked:
