@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mmsynth.scene.capture.adjustment import inverse
 from mmsynth.scene.capture.board import Board, corner_points
 from mmsynth.scene.capture.board_frames import SensorFrames
 from mmsynth.scene.capture.detection import Detection
 from mmsynth.scene.layouts.calibration import RigSensor
+from mmsynth.scene.motion import inverse
 from mmsynth.sensors.camera import Camera, project, ray_map
 
 BOARD = Board(kind="charuco", squares=(5, 7), square=0.036, marker=0.027)

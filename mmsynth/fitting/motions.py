@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from mmsynth.scene.motion import cross_matrix, matrix_to_motion, motion_to_matrix
 from mmsynth.scene.scene import Frame, Region
 
 _HUBER = 0.5  # relative residuals beyond it count by their size and not by their square, as in the loss
@@ -104,19 +104,6 @@ def layout_of(frames: list[Frame], sensors: tuple[str, ...], region: Region) -> 
             adjoint[sensor[f]] = _adjoint(poses[f], poses[anchor[view[f]]])
     focal = np.array([0.5 * (f.camera.fx + f.camera.fy) for f in frames])
     return Layout(poses, view, sensor, views, sensors, anchor, np.any(adjoint != 0, axis=(1, 2)), adjoint, _pixels(poses, focal))
-
-
-def motion_to_matrix(motion: np.ndarray) -> np.ndarray:
-    """(N, 6) → (N, 4, 4): rotation by the exponential map, translation as it is (SciPy: kornia's takes three times as long)."""
-    out = np.tile(np.eye(4), (len(motion), 1, 1))
-    out[:, :3, :3] = Rotation.from_rotvec(motion[:, :3]).as_matrix()
-    out[:, :3, 3] = motion[:, 3:]
-    return out
-
-
-def matrix_to_motion(matrix: np.ndarray) -> np.ndarray:
-    """The inverse of ``motion_to_matrix``: (N, 4, 4) → (N, 6)."""
-    return np.concatenate([Rotation.from_matrix(matrix[:, :3, :3]).as_rotvec(), matrix[:, :3, 3]], 1)
 
 
 def in_world(layout: Layout, motions: Motions) -> np.ndarray:
@@ -238,7 +225,7 @@ def advance(layout: Layout, motions: Motions, step: Motions) -> Motions:
         turn, centre = np.swapaxes(anchors[:, :3, :3], 1, 2), anchors[:, :3, 3]
         similarity = np.zeros((len(some), 6, 7))
         similarity[:, :3, :3], similarity[:, 3:, 3:6] = turn, turn
-        similarity[:, 3:, :3] = -turn @ _cross(centre)
+        similarity[:, 3:, :3] = -turn @ cross_matrix(centre)
         similarity[:, 3:, 6] = _times(turn, centre)
         metric = layout.pixels[layout.anchor[some]]
         normal = np.einsum("vai,vab,vbj->ij", similarity, metric, similarity)
@@ -252,7 +239,7 @@ def _pixels(poses: np.ndarray, focal: np.ndarray) -> np.ndarray:
     seen = np.einsum("fji,fqj->fqi", poses[:, :3, :3], _POINTS - poses[:, None, :3, 3])
     away = np.maximum(np.linalg.norm(seen, axis=-1), 1.0)[..., None]
     ray = seen / away
-    shift = np.concatenate([-_cross(ray), np.eye(3) / away[..., None]], -1)
+    shift = np.concatenate([-cross_matrix(ray), np.eye(3) / away[..., None]], -1)
     shift -= ray[..., :, None] * (ray[..., None, :] @ shift)
     return focal[:, None, None] ** 2 * np.einsum("fqai,fqaj->fij", shift, shift) / len(_POINTS)
 
@@ -262,13 +249,8 @@ def _adjoint(to: np.ndarray, of: np.ndarray) -> np.ndarray:
     back, turn = np.swapaxes(to[..., :3, :3], -1, -2), of[..., :3, :3]
     out = np.zeros((*to.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = back @ turn
-    out[..., 3:, :3] = -back @ _cross(to[..., :3, 3] - of[..., :3, 3]) @ turn
+    out[..., 3:, :3] = -back @ cross_matrix(to[..., :3, 3] - of[..., :3, 3]) @ turn
     return out
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    """(..., 3) → (..., 3, 3), the matrix of w → v × w."""
-    return np.cross(np.eye(3), v[..., None, :])
 
 
 def _grouped(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:

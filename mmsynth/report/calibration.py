@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from mmsynth.files import write_text
+from mmsynth.report.page import svg, write_page
 from mmsynth.scene.capture.board import corner_points
 from mmsynth.scene.capture.calibrate import Calibration
 from mmsynth.sensors.camera import COEFFICIENTS, unproject
@@ -20,16 +17,8 @@ from mmsynth.sensors.camera import COEFFICIENTS, unproject
 _AXIS = 0.15  # of the rig's extent: how long cameras are drawn
 _BOARDS = 40  # boards drawn at the most
 
-_TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1"><title>{{ title }}</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #ddd }
-.scroll { overflow-x: auto } table { border-collapse: collapse }
-td, th { padding: .25rem .8rem; border-bottom: 1px solid #eee; text-align: left; vertical-align: top }
-svg { max-width: 100%; height: auto } .note { color: #555; font-size: .9rem }
-</style></head><body>
-<h1>{{ title }}</h1><p class="note">{{ subtitle }}</p>
+_BODY = """\
+<p class="note">{{ subtitle }}</p>
 {% if problems %}<h2>To know</h2><ul>{% for line in problems %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
 {% for heading, header, rows, note in tables %}<h2>{{ heading }}</h2>
 <div class="scroll"><table><tr>{% for cell in header %}<th>{{ cell }}</th>{% endfor %}</tr>
@@ -39,7 +28,6 @@ svg { max-width: 100%; height: auto } .note { color: #555; font-size: .9rem }
 <p class="note">Left: every corner at its place in the picture with its residual, enlarged as said. Right: all residuals [px].</p>
 <h2>The rig</h2>{{ rig | safe }}<p class="note">Cameras look along their blue axis; boards in grey, in the reference's frame [m].</p>
 <h2>Residuals of every board</h2>{{ boards | safe }}
-</body></html>
 """
 
 
@@ -51,11 +39,11 @@ def write_calibration_report(path: Path, calibration: Calibration) -> None:
         "subtitle": f"Reference: {order[0]}. Boards: {', '.join(map(str, calibration.boards))}. {len(calibration.seen)} sightings used.",
         "problems": calibration.problems,
         "tables": [_sensors(calibration), _cameras(calibration), _left_out(calibration)],
-        "residuals": _svg(_residuals(calibration)),
-        "rig": _svg(_rig(calibration)),
-        "boards": _svg(_by_board(calibration)),
+        "residuals": svg(_residuals(calibration)),
+        "rig": svg(_rig(calibration)),
+        "boards": svg(_by_board(calibration)),
     }
-    write_text(path, jinja2.Environment(autoescape=True).from_string(_TEMPLATE).render(page))
+    write_page(path, _BODY, page)
 
 
 _Table = tuple[str, list[str], list[list[str]], str]
@@ -192,13 +180,6 @@ def _by_board(calibration: Calibration) -> Figure:
     axes.legend(frameon=False, fontsize=8)
     axes.grid(alpha=0.25)
     return figure
-
-
-def _svg(figure: Figure) -> str:
-    stream = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})
-    text = stream.getvalue()
-    return text[text.index("<svg") :]
 
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:

@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from mmsynth.files import write_text
+from mmsynth.report.page import svg, write_page
 from mmsynth.scene.capture.pose import PosedCapture
 
 _POINTS = 3000  # drawn at the most
 
-_TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #ddd }
-.scroll { overflow-x: auto } table { border-collapse: collapse }
-td, th { padding: .25rem .8rem; border-bottom: 1px solid #eee; text-align: left; vertical-align: top }
-td.number { text-align: right; font-variant-numeric: tabular-nums } svg { max-width: 100%; height: auto } .note { color: #555 }
-</style></head><body>
-<h1>{{ title }}</h1>
+_BODY = """\
 <p>{{ subtitle }}</p>
 {% for note in notes %}<p class="note">{{ note }}</p>
 {% endfor %}
@@ -40,7 +27,6 @@ td.number { text-align: right; font-variant-numeric: tabular-nums } svg { max-wi
 {{ drawing | safe }}
 <h2>Reprojection error of every picture</h2>
 {{ residuals | safe }}
-</body></html>
 """
 
 
@@ -69,7 +55,7 @@ def write_pose_report(path: Path, posed: PosedCapture, facts: Mapping[str, Any])
         "drawing": _drawing(posed),
         "residuals": _residuals(posed),
     }
-    write_text(path, jinja2.Environment(autoescape=True).from_string(_TEMPLATE).render(page))
+    write_page(path, _BODY, page)
     return path
 
 
@@ -100,7 +86,7 @@ def _drawing(posed: PosedCapture) -> str:
         panel.plot(posed.region.radius * np.cos(angle), posed.region.radius * np.sin(angle), color="#888", linewidth=0.8)
         panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title=title, xlabel=f"[{posed.unit}]")
     figure.axes[0].legend(frameon=False)
-    return _svg(figure)
+    return svg(figure)
 
 
 def _residuals(posed: PosedCapture) -> str:
@@ -113,14 +99,7 @@ def _residuals(posed: PosedCapture) -> str:
     panel.set(xlabel="view", ylabel="rms [px]", ylim=(0, None))
     panel.grid(alpha=0.25)
     panel.legend(frameon=False)
-    return _svg(figure)
-
-
-def _svg(figure: Figure) -> str:
-    stream = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})
-    text = stream.getvalue()
-    return text[text.index("<svg") :]
+    return svg(figure)
 
 
 def pose_text(facts: Mapping[str, Any]) -> str:

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 import torch
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
-from mmsynth.files import write_text
 from mmsynth.fitting.choices import choices_of
 from mmsynth.operations.output import previews
+from mmsynth.report.page import svg, write_page
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Scene, Sensor
 from mmsynth.scene.white_balance import white_balance_of
@@ -43,19 +40,7 @@ _COLUMNS = {
     "aolp_mae": ("AoLP error [°]", 2),
 }
 
-_TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #ddd }
-.scroll { overflow-x: auto } table { border-collapse: collapse }
-td, th { padding: .25rem .8rem; border-bottom: 1px solid #eee; text-align: left; vertical-align: top }
-td.number { text-align: right; font-variant-numeric: tabular-nums }
-figure { display: inline-block; margin: .4rem .6rem .4rem 0 } figcaption { font-size: .85rem; color: #555 }
-figure img { height: 200px; image-rendering: pixelated } svg { max-width: 100%; height: auto } .note { color: #555; font-size: .9rem }
-</style></head><body>
-<h1>{{ title }}</h1>
+_BODY = """\
 <p class="note">{{ subtitle }}</p>
 {% if scores %}<h2>Scores on the test views</h2>
 <div class="scroll"><table><tr><th>modality</th>{% for c in columns %}<th>{{ c }}</th>{% endfor %}</tr>
@@ -71,8 +56,7 @@ only.</p>{% endif %}
 {% if curve %}<h2>The fit</h2>{{ curve | safe }}{% endif %}
 {% for heading, lines in tables if lines %}<h2>{{ heading }}</h2>
 <table>{% for k, v in lines %}<tr><td>{{ k }}</td><td>{{ v }}</td></tr>{% endfor %}</table>
-{% endfor %}</body></html>
-"""
+{% endfor %}"""
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -112,10 +96,7 @@ def curve_svg(log: Sequence[Mapping[str, Any]]) -> str:
         right.legend(frameon=False)
     for axes in (left, right):
         axes.grid(alpha=0.25)
-    stream = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})
-    text = stream.getvalue()
-    return text[text.index("<svg") :]
+    return svg(figure)
 
 
 def _number(value: Any) -> float:
@@ -258,13 +239,12 @@ def write_run_report(
         "curve": curve_svg(log),
         "tables": [("What the scene needed", needed), ("The run", facts)],
     }
-    html = jinja2.Environment(autoescape=True).from_string(_TEMPLATE).render(page)
     if rows:
         images = [[image for _, image in row] for row in rows]
         captions = [[caption for caption, _ in row] for row in rows]
         previews.contact_sheet(images, captions, run_dir / "preview.png")
     path = run_dir / "report.html"
-    write_text(path, html)
+    write_page(path, _BODY, page)
     return path
 
 

@@ -16,11 +16,11 @@ from small_scenes import FOCAL, HEIGHT, QUICK, RADIUS, WIDTH, around, look_from,
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
-from mmsynth.fitting import motions
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.scene.load import load_scene
+from mmsynth.scene.motion import matrix_to_motion, motion_to_matrix
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
 
@@ -347,21 +347,21 @@ def test_rotations_by_nothing_and_by_half_a_turn(row: Row) -> None:
     for angle in (0.0, 1e-12, 1e-8, 1e-4, 1.0, math.pi - 1e-7, math.pi):
         axis = generator.normal(size=3)
         motion = np.concatenate([angle * axis / np.linalg.norm(axis), generator.normal(size=3)])
-        matrix = motions.motion_to_matrix(motion[None])[0]
+        matrix = motion_to_matrix(motion[None])[0]
         assert np.isfinite(matrix).all() and np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < 1e-12
-        again = motions.motion_to_matrix(motions.matrix_to_motion(matrix[None]))[0]
+        again = motion_to_matrix(matrix_to_motion(matrix[None]))[0]
         worst = max(worst, float(np.abs(again - matrix).max()))
     assert worst < 1e-6
     with np.errstate(invalid="ignore"):
         assert np.isnan(_rodrigues(np.zeros(3))).all() and np.isnan(_log(np.eye(3))).all()
-    some = motions.motion_to_matrix(np.array([[0.3, -0.4, 0.1, 0.0, 0.0, 0.0]]))[0, :3, :3]
+    some = motion_to_matrix(np.array([[0.3, -0.4, 0.1, 0.0, 0.0, 0.0]]))[0, :3, :3]
     np.testing.assert_allclose(_rodrigues(_log(some)), some, atol=1e-12)
     axes = generator.normal(size=(100, 3))
     turns = np.concatenate([math.pi * axes / np.linalg.norm(axes, axis=1, keepdims=True), np.zeros((100, 3))], 1)
-    half = motions.motion_to_matrix(turns)
+    half = motion_to_matrix(turns)
     with np.errstate(divide="ignore", invalid="ignore"):
         lost = sum(not np.abs(_rodrigues(_log(m[:3, :3])) - m[:3, :3]).max() < 0.1 for m in half)
-    assert lost > 30 and np.abs(motions.motion_to_matrix(motions.matrix_to_motion(half)) - half).max() < 1e-6
+    assert lost > 30 and np.abs(motion_to_matrix(matrix_to_motion(half)) - half).max() < 1e-6
     row(
         "rotations by 0 and by π",
         f"exp by ω / norm(ω): NaN at 0; log by θ / (2 sin θ) (R - Rᵀ): NaN at 0, another axis or NaN for {lost} of 100 at π",

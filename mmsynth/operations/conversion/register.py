@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.fitting.motions import motion_to_matrix
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.capture.boards import Corner, board_corners, markers_in
 from mmsynth.scene.images import load_frame
+from mmsynth.scene.motion import motion_to_matrix
 from mmsynth.scene.scene import Scene, Sensor
 from mmsynth.sensors.camera import Camera, project, ray_map, unproject
 from mmsynth.sensors.mosaic import channel_map, channels_of

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mmsynth.scene.capture.derivatives import project_with_derivatives
+from mmsynth.scene.motion import cross_matrix, motion_to_matrix
 from mmsynth.sensors.camera import Camera
 
 Loss = Literal["cauchy", "huber"]
@@ -77,23 +77,6 @@ class Adjusted:
     sigma: np.ndarray
     covariance: np.ndarray
     starts: np.ndarray
-
-
-def rigid(motion: np.ndarray) -> np.ndarray:
-    """(..., 6) rotation vector and translation → (..., 4, 4)."""
-    out = np.zeros((*motion.shape[:-1], 4, 4))
-    out[..., :3, :3] = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
-    out[..., :3, 3], out[..., 3, 3] = motion[..., 3:], 1.0
-    return out
-
-
-def inverse(pose: np.ndarray) -> np.ndarray:
-    """Of rigid motions (..., 4, 4)."""
-    out = np.zeros_like(pose)
-    turned = np.swapaxes(pose[..., :3, :3], -1, -2)
-    out[..., :3, :3], out[..., :3, 3] = turned, -(turned @ pose[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
 
 
 def adjust(state: RigState, views: Sequence[View], loss: Loss = "huber", steps: int = 60) -> Adjusted:
@@ -198,11 +181,11 @@ class _Problem:
             variance = (sigma[s] * self.spread[rows]) ** 2
             weight = _trust((error**2).sum(1) / variance, loss) / variance
             turn = state.to_sensor[s, :3, :3] @ state.boards[:, :3, :3]
-            on_board = np.concatenate([-_cross(self.points[rows]), np.broadcast_to(np.eye(3), (len(rows), 3, 3))], 2)
+            on_board = np.concatenate([-cross_matrix(self.points[rows]), np.broadcast_to(np.eye(3), (len(rows), 3, 3))], 2)
             by_board = by_point @ turn[pose] @ on_board
             parts = [by_camera[:, :, state.free[s]]]
             if s:
-                parts.append(by_point @ np.concatenate([-_cross(local), np.broadcast_to(np.eye(3), (len(rows), 3, 3))], 2))
+                parts.append(by_point @ np.concatenate([-cross_matrix(local), np.broadcast_to(np.eye(3), (len(rows), 3, 3))], 2))
             system.add(
                 slice(self.starts[s], self.starts[s] + sum(p.shape[2] for p in parts)),
                 pose,
@@ -223,21 +206,13 @@ class _Problem:
             fresh.append(replace(camera, fx=values[0], fy=values[1], cx=values[2], cy=values[3], distortion=tuple(values[4:])))
             if s:
                 at = self.starts[s] + len(free)
-                to_sensor[s] = rigid(cameras[at : at + 6]) @ to_sensor[s]
-        return replace(state, cameras=tuple(fresh), to_sensor=to_sensor, boards=state.boards @ rigid(boards))
+                to_sensor[s] = motion_to_matrix(cameras[None, at : at + 6])[0] @ to_sensor[s]
+        return replace(state, cameras=tuple(fresh), to_sensor=to_sensor, boards=state.boards @ motion_to_matrix(boards))
 
 
 def _trust(square: np.ndarray, loss: Loss) -> np.ndarray:
     """Weights by the squared length of residuals over their standard deviation: the slope of the loss."""
     return 1 / (1 + square / _CAUCHY**2) if loss == "cauchy" else np.minimum(1.0, _HUBER / np.sqrt(np.maximum(square, 1e-12)))
-
-
-def _cross(vectors: np.ndarray) -> np.ndarray:
-    """(N, 3) → (N, 3, 3) matrices of v ×."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    return out - out.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.scene.capture.triangulation import Sighting, nearest_point, reprojection_error
 from mmsynth.scene.images import read_image
-from mmsynth.scene.region import nearest_to_rays
 from mmsynth.scene.scene import Frame
-from mmsynth.sensors.camera import project, unproject
 
 _DICTIONARIES = (cv2.aruco.DICT_4X4_1000, cv2.aruco.DICT_5X5_1000, cv2.aruco.DICT_6X6_1000, cv2.aruco.DICT_7X7_1000)
 _LOOK, _MOST = 4, 16  # frames that are looked at before the search is given up, and at the most
@@ -21,7 +20,6 @@ _VIEWS = 3  # that must agree on a corner
 _APART = 2.0  # pixels (of the smaller picture) by which they may disagree
 
 Corner = tuple[int, int, int]  # dictionary, marker, which of its four corners
-Sighting = tuple[Frame, np.ndarray]
 
 
 def board_points(frames: Sequence[Frame]) -> np.ndarray:
@@ -89,14 +87,11 @@ def _triangulated(seen: list[Sighting]) -> np.ndarray | None:
     """The point nearest to all rays (least squares), (3,); None where too few views see it or they do not agree."""
     if len(seen) < _VIEWS:
         return None
-    directions, valid = zip(*(unproject(pixel, frame.camera) for frame, pixel in seen), strict=True)
-    poses = np.stack([frame.camera_to_world for frame, _ in seen])
-    point = nearest_to_rays(poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], directions)) if all(valid) else None
+    point = nearest_point(seen)
     if point is None:
         return None
     for frame, pixel in seen:
-        local = frame.camera_to_world[:3, :3].T @ (point - frame.camera_to_world[:3, 3])
-        apart = np.linalg.norm(project(local, frame.camera) - pixel) * min(1.0, _WIDTH / max(frame.camera.width, frame.camera.height))
-        if not apart <= _APART:  # NaN, too: behind a camera
+        scale = min(1.0, _WIDTH / max(frame.camera.width, frame.camera.height))
+        if not reprojection_error(point, frame, pixel) * scale <= _APART:  # NaN, too: behind a camera
             return None
     return point

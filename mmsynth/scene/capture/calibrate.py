@@ -15,7 +15,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.scene.capture import diagnosis
-from mmsynth.scene.capture.adjustment import Adjusted, RigState, View, adjust, inverse
+from mmsynth.scene.capture.adjustment import Adjusted, RigState, View, adjust
 from mmsynth.scene.capture.board import Board, corner_points
 from mmsynth.scene.capture.board_frames import SensorFrames, find_in_frames, list_frames
 from mmsynth.scene.capture.detection import Detection
@@ -23,6 +23,7 @@ from mmsynth.scene.capture.expected import find_where_expected
 from mmsynth.scene.capture.lens_choice import MODELS, Alone, board_pose, calibrate_alone, errors_of, plain_camera
 from mmsynth.scene.capture.topology import Key, place_sensors, relabelled
 from mmsynth.scene.layouts.calibration import Rig, RigSensor
+from mmsynth.scene.motion import inverse
 from mmsynth.scene.scene import canonical_modality
 from mmsynth.sensors.camera import COEFFICIENTS, Camera
 

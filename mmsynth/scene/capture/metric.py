@@ -11,10 +11,9 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.scene.capture.board import Board, corner_points
 from mmsynth.scene.capture.detection import find_boards
+from mmsynth.scene.capture.triangulation import Sighting, nearest_point, reprojection_error
 from mmsynth.scene.images import read_native
-from mmsynth.scene.region import nearest_to_rays
 from mmsynth.scene.scene import Frame, Sensor
-from mmsynth.sensors.camera import project, unproject
 
 _MOST = 24  # frames that are searched
 _VIEWS = 3  # that must agree on a corner
@@ -48,7 +47,7 @@ def scale_of_boards(frames: Sequence[Frame], sensor: Sensor, boards: Sequence[Bo
         InputError: no board of which six corners are seen in three frames that agree.
     """
     chosen = [frames[i] for i in sorted({round(x) for x in np.linspace(0, len(frames) - 1, min(_MOST, len(frames)))})]
-    sightings: dict[tuple[int, int], list[tuple[Frame, np.ndarray]]] = defaultdict(list)
+    sightings: dict[tuple[int, int], list[Sighting]] = defaultdict(list)
     seen_in = set()
     for frame in chosen:
         for detection in find_boards(read_native(frame.path), boards, sensor.mosaic):
@@ -74,25 +73,18 @@ def scale_of_boards(frames: Sequence[Frame], sensor: Sensor, boards: Sequence[Bo
     return BoardScale(scale, max(float(1.0 / np.sqrt(weight.sum())), spread), int(counts.sum()), len(fits), len(seen_in))
 
 
-def _triangulated(seen: Sequence[tuple[Frame, np.ndarray]]) -> np.ndarray | None:
+def _triangulated(seen: Sequence[Sighting]) -> np.ndarray | None:
     """The point (3,) nearest to the rays of a corner, without those that do not agree; None where fewer than three do."""
     kept = list(seen)
     while len(kept) >= _VIEWS:
-        rays, valid = zip(*(unproject(pixel, frame.camera) for frame, pixel in kept), strict=True)
-        poses = np.stack([frame.camera_to_world for frame, _ in kept])
-        point = nearest_to_rays(poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], rays)) if all(valid) else None
+        point = nearest_point(kept)
         if point is None:
             return None
-        apart = np.array([_apart(point, frame, pixel) for frame, pixel in kept])
+        apart = np.array([reprojection_error(point, frame, pixel) for frame, pixel in kept])
         if np.nanmax(apart) <= _APART and np.isfinite(apart).all():
             return point
         kept.pop(int(np.argmax(np.where(np.isfinite(apart), apart, np.inf))))
     return None
-
-
-def _apart(point: np.ndarray, frame: Frame, pixel: np.ndarray) -> float:
-    local = frame.camera_to_world[:3, :3].T @ (point - frame.camera_to_world[:3, 3])
-    return float(np.linalg.norm(project(local, frame.camera) - pixel))
 
 
 def _fit(board: np.ndarray, found: dict[int, np.ndarray]) -> tuple[float, float, int]:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mmsynth.scene.capture.adjustment import inverse
 from mmsynth.scene.capture.board import Board, corner_points, turns
+from mmsynth.scene.motion import inverse
 
 _CAPPED = 0.2  # distance of two places, in depths of the board and in radians, from which they do not agree at all
 _CLEAR = 2.0  # how much better the right labels must agree than any others

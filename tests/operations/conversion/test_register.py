@@ -16,10 +16,10 @@ from scipy.ndimage import map_coordinates
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Design, Field
-from mmsynth.fitting.motions import matrix_to_motion, motion_to_matrix
 from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.register import Landmarks, landmarks, register
 from mmsynth.scene.image_writers import write_png16
+from mmsynth.scene.motion import matrix_to_motion, motion_to_matrix
 from mmsynth.scene.scene import Frame, Region, Scene, Split
 from mmsynth.sensors.camera import Camera, project, ray_map
 from mmsynth.sensors.mosaic import mosaic

@@ -9,11 +9,12 @@ import torch
 from drawn_rig import BOARD, CHESSBOARD, EVEN, board_poses, five_sensors, seen_corners
 
 from mmsynth.errors import InputError
-from mmsynth.scene.capture.adjustment import View, inverse
+from mmsynth.scene.capture.adjustment import View
 from mmsynth.scene.capture.board import corner_points
 from mmsynth.scene.capture.calibrate import Calibration, calibrate_found
 from mmsynth.scene.capture.derivatives import project_with_derivatives
 from mmsynth.scene.capture.lens_choice import calibrate_alone
+from mmsynth.scene.motion import inverse
 from mmsynth.sensors.camera import Camera, project_points
 
 NOISE = 0.05
