@@ -17,8 +17,8 @@ from mmsynth.fitting.choices import choices_of
 from mmsynth.operations.output import previews
 from mmsynth.report.page import svg, write_page
 from mmsynth.scene.images import load_frame
+from mmsynth.scene.preview_colours import preview_colours_of
 from mmsynth.scene.scene import Frame, Scene, Sensor
-from mmsynth.scene.white_balance import white_balance_of
 from mmsynth.sensors.mosaic import channels_of, demosaic_edge_aware, is_bayer
 from mmsynth.sensors.polarization import intensities_to_stokes
 
@@ -137,13 +137,13 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tupl
             measured = measured_channels(scene.sensors[name], frame)
             rendering = field.render(frame.camera, field.pose_of(frame), [name], geometry=first)
             ours = rendering.channels[name]
-            balance = white_balance_of(scene.sensors[name], scene.frames_of(name))
-            linear = previews.preview_linear(sensor, measured, balance)
+            colours = preview_colours_of(scene.sensors[name], scene.frames_of(name))
+            linear = previews.preview_linear(sensor, measured, colours)
             exposure = previews.exposure_of(linear)
             difference = np.abs(np.nan_to_num(ours) - measured).mean(-1) * rendering.valid
             row = [
                 (f"{name}: frame {frame.view}", previews.to_uint8(previews.tone_map(linear, exposure))),
-                ("rendering", previews.preview_rgb(sensor, ours, exposure, balance)),
+                ("rendering", previews.preview_rgb(sensor, ours, exposure, colours)),
                 ("difference x 5", previews.to_uint8(5.0 * difference)),
             ]
             if sensor.polarizer_angles_deg is not None:

@@ -13,9 +13,9 @@ from mmsynth.errors import InputError
 from mmsynth.scene.encoding import encoding_of
 from mmsynth.scene.images import check_file, load_frame, read_native, used_bits
 from mmsynth.scene.masks import read_mask
+from mmsynth.scene.preview_colours import preview_colours_of
 from mmsynth.scene.scene import Frame, Scene, Sensor
 from mmsynth.scene.serialisation import sensor_to_json
-from mmsynth.scene.white_balance import white_balance_of
 from mmsynth.sensors.camera import Camera, round_trip_error
 
 T = TypeVar("T")
@@ -53,7 +53,7 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
     statistics mean, min, max, saturated_percent over frames_measured, and the lens of the first frame: its model, invalid_lens_pixels,
     photosites without a ray, round_trip_px, how far from its pixel a ray in float32 comes back at the most (of every n-th row and
     column where the frame has more than 250 000 pixels); encoding: how values stand to light, and why (``encoding.encoding_of``);
-    white_balance: for previews alone (``white_balance.white_balance_of``)."""
+    preview_colours: for previews alone (``preview_colours.preview_colours_of``)."""
     frames = scene.frames_of(sensor.name)
     camera = frames[0].camera
     out: dict[str, Any] = {
@@ -81,8 +81,8 @@ def _describe_sensor(scene: Scene, sensor: Sensor, measured_frames: int, problem
     if masked:
         out["foreground_percent"] = _foreground_percent(sensor, masked, measured_frames, problems)
     encoding = _tried(problems, encoding_of, sensor, [frames[index].path for index in _spread(len(frames), _ENCODING_FRAMES)])
-    balance = white_balance_of(sensor, frames)
-    out["white_balance"] = None if balance is None else asdict(balance)
+    colours = preview_colours_of(sensor, frames)
+    out["preview_colours"] = None if colours is None else asdict(colours)
     out["encoding"] = None if encoding is None else asdict(encoding)
     if out["file_type"] == "uint16" and out["max"] is not None and out["max"] <= 4095 / 65535:
         problems.append(f"{sensor.name}: no value exceeds {out['max']:.3f} of full scale, as in 12-bit data that is not left-aligned.")
@@ -193,10 +193,8 @@ def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
         )
     if sensor["encoding"] is not None:
         lines.append(f"  encoding  {sensor['encoding']['verdict']}: {sensor['encoding']['because']}")
-    if sensor["white_balance"] is not None:
-        found = sensor["white_balance"]
-        gains = " ".join(f"{gain:.3f}" for gain in found["gains"])
-        lines.append(f"  balance   gains {gains} by {found['markers']} markers (agree within {found['spread']:.1%}), for previews alone")
+    if sensor["preview_colours"] is not None:
+        lines.append(f"  balance   {_colours(sensor['preview_colours'])}, for previews alone")
     back = (
         "no pixel has a ray"
         if sensor["round_trip_px"] is None
@@ -206,3 +204,12 @@ def _sensor_lines(name: str, sensor: dict[str, Any]) -> list[str]:
     lost = f"; {sensor['invalid_lens_pixels']} pixels ({share:.2f} %) have no ray and are not used" if share else ""
     lines.append(f"  lens      {sensor['lens']}, {back}{lost}")
     return lines
+
+
+def _colours(found: dict[str, Any]) -> str:
+    rows = found["matrix"]
+    if found["seen"] == "board":
+        gains = " ".join(f"{rows[i][i]:.3f}" for i in range(3))
+        return f"gains {gains} by a board's black and white, {found['count']} times (agree within {found['spread']:.1%})"
+    text = "; ".join(" ".join(f"{value:.3f}" for value in row) for row in rows)
+    return f"matrix {text} by the patches of a colour chart (agree within {found['spread']:.1%})"

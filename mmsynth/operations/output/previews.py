@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from mmsynth.files import write_atomic
+from mmsynth.scene.preview_colours import PreviewColours
 from mmsynth.scene.scene import Sensor
-from mmsynth.scene.white_balance import WhiteBalance
 from mmsynth.sensors.polarization import angle_of_linear_polarization, degree_of_linear_polarization
 
 # a display's red, green and blue as bumps over the spectrum: centre and width in nm; enough to recognise a scene, no colorimetry
@@ -44,10 +44,10 @@ def preview_weights(sensor: Sensor) -> np.ndarray:
     return np.eye(count)[chosen]
 
 
-def preview_linear(sensor: Sensor, channels: np.ndarray, balance: WhiteBalance | None = None) -> np.ndarray:
-    """(H, W, C) → (H, W, 3) float32, linear, white-balanced, not yet exposed; NaN (no ray) becomes 0."""
+def preview_linear(sensor: Sensor, channels: np.ndarray, colours: PreviewColours | None = None) -> np.ndarray:
+    """(H, W, C) → (H, W, 3) float32, linear, in sRGB's colours where they are known, not yet exposed; NaN (no ray) becomes 0."""
     mixed = np.nan_to_num(channels.astype(np.float32)) @ preview_weights(sensor).T.astype(np.float32)
-    return mixed.clip(min=0.0) if balance is None else mixed.clip(min=0.0) * np.array(balance.gains, np.float32)
+    return mixed.clip(min=0.0) if colours is None else (mixed.clip(min=0.0) @ np.array(colours.matrix, np.float32).T).clip(min=0.0)
 
 
 def exposure_of(linear: np.ndarray, percentile: float = 99.0) -> float:
@@ -67,9 +67,9 @@ def to_uint8(display: np.ndarray) -> np.ndarray:
     return np.round(np.clip(np.nan_to_num(display), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def preview_rgb(sensor: Sensor, channels: np.ndarray, exposure: float | None = None, balance: WhiteBalance | None = None) -> np.ndarray:
+def preview_rgb(sensor: Sensor, channels: np.ndarray, exposure: float | None = None, colours: PreviewColours | None = None) -> np.ndarray:
     """All channels of a sensor (H, W, C), linear → (H, W, 3) uint8, tone-mapped."""
-    return to_uint8(tone_map(preview_linear(sensor, channels, balance), exposure))
+    return to_uint8(tone_map(preview_linear(sensor, channels, colours), exposure))
 
 
 def preview_dolp(stokes: np.ndarray) -> np.ndarray:
