@@ -147,6 +147,7 @@ def batch(
     poses: Annotated[Path | None, typer.Option(help="of a dataset of each, as for generate-dataset; none: only fits")] = None,
     recipe: RecipeOption = None,
     modalities: ModalitiesOption = None,
+    masks: MasksOption = None,
     budget: Annotated[str | None, typer.Option(help="time of each fit, e.g. 60s or 5m")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="or its optimiser steps")] = None,
     rig: Annotated[str, typer.Option(help="aligned or native")] = "aligned",
@@ -165,9 +166,10 @@ def batch(
     seconds = fit_length(steps, budget)
     listed, part = read_scene_list(scenes), partition_of_environment()
     names = modality_names(modalities)
+    meaning, folder = masks_of(masks)
     job = SceneJob(
         load_recipe(recipe), steps, seconds, seed, pick_device(device),
-        modalities=None if names is None else tuple(names), poses=poses,
+        modalities=None if names is None else tuple(names), masks=meaning, mask_folder=folder, poses=poses,
         rig=cast("Rig", rig), file_format=cast("DatasetFormat", file_format),
     )  # fmt: skip
     outcomes = run_batch(listed, out, job, part=part, say=(lambda text: None) if as_json else print)

@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption, lengths, modality_names, scene_path, view_ids
+from mmsynth.cli.arguments import (
+    AlsoOption,
+    DeviceOption,
+    ImagesOption,
+    JsonOption,
+    MasksOption,
+    RunOption,
+    lengths,
+    masks_of,
+    modality_names,
+    scene_path,
+    sensor_folders,
+    view_ids,
+)
 from mmsynth.cli.terminal import command, print_written, progress_bar
 from mmsynth.errors import InputError
 
@@ -269,6 +282,9 @@ def export(
                                    "default: the last fit made in this folder")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="default: SCENE-LAYOUT in this folder, or RUN/export/LAYOUT")] = None,
+    images: ImagesOption = None,
+    also: AlsoOption = None,
+    masks: MasksOption = None,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Write a scene in another layout: pictures byte for byte, poses, lenses, masks, test views, sparse points."""
@@ -277,11 +293,14 @@ def export(
     from mmsynth.scene.load import load_scene
     from mmsynth.workflows.runs import is_run, open_run
 
+    meaning, folder = masks_of(masks)
     if source is None or is_run(Path(source)):
+        if images or also or masks:
+            raise InputError("--images, --also, --masks: a run has the pictures that it was fitted to, expected them with a scene.")
         opened = open_run(None if source is None else Path(source))
         scene, field, destination = opened.scene, opened.field, out or opened.folder / "export" / layout
     else:
-        scene, field = load_scene(scene_path(source)), None
+        scene, field = load_scene(scene_path(source), images=images, also=sensor_folders(also), masks=meaning, mask_folder=folder), None
         destination = out or Path(f"{scene.root.resolve().name}-{layout}")
     with progress_bar("export", as_json) as show:
         written = export_scene(scene, destination, layout=cast("ExportLayout", layout), field=field, progress=show)

@@ -20,7 +20,7 @@ from mmsynth.operations.output.work_partition import WorkPartition, local_device
 from mmsynth.operations.views.load import Rig
 from mmsynth.report.report import write_run_report
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import MaskMeaning, Scene
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class SceneJob:
     seed: int = 0
     device: str = "cpu"
     modalities: tuple[str, ...] | None = None
+    masks: MaskMeaning | None = None
+    mask_folder: Path | None = None
     poses: Path | None = None
     rig: Rig = "aligned"
     file_format: DatasetFormat = "npz"
@@ -97,7 +99,7 @@ def run_batch(
 
 
 def _fit_and_generate(path: Path, out: Path, job: SceneJob) -> dict[str, Any]:
-    scene = load_scene(path, modalities=job.modalities)
+    scene = load_scene(path, modalities=job.modalities, masks=job.masks, mask_folder=job.mask_folder)
     run = out / "run"
     field = _fitted(scene, run, job)
     made = None

@@ -223,6 +223,7 @@ def test_a_batch_goes_on_after_a_scene_that_fails(scene: Path, tmp_path: Path) -
     (tmp_path / "list.txt").write_text("bad  # holds nothing\n\ngood\n")
     (tmp_path / "orbit.json").write_text(json.dumps({"trajectory": "orbit", "views": 2}))
     command = ("batch", "list.txt", "--steps", "12", "--modalities", "mono,nir", "--poses", "orbit.json", "--format", "webdataset")
+    command = (*command, "--masks", "ignore")
     result = here(tmp_path, *command)
     assert result.returncode == 2 and "1 of 2 scenes failed" in result.stderr and "bad" in result.stderr
     assert json.loads((tmp_path / "batch/bad/outcome.json").read_text())["error"].startswith("bad")
@@ -230,6 +231,7 @@ def test_a_batch_goes_on_after_a_scene_that_fails(scene: Path, tmp_path: Path) -
     outcome = json.loads((tmp_path / "batch" / name / "outcome.json").read_text())
     assert Path(tmp_path / outcome["dataset"]).is_file() and (tmp_path / outcome["run"] / "report.html").is_file()
     before = (tmp_path / outcome["run"] / "manifest.json").read_bytes()
+    assert json.loads(before)["scene"]["masks"] == "ignore"
     again = here(tmp_path, *command, "--json")
     assert again.returncode == 2 and set(json.loads(again.stdout)["scenes"]) == {"bad", name}
     assert (tmp_path / outcome["run"] / "manifest.json").read_bytes() == before

@@ -48,6 +48,31 @@ def test_one_line_of_options_is_remembered_by_the_run(tmp_path: Path, monkeypatc
     assert manifest["scene"]["images"] == str(root / "cache" / "rgba") and manifest["scene"]["also"] == {"nir": str(root / "cache" / "nir")}
 
 
+def test_export_reads_what_info_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _scene(tmp_path / "scene")
+    monkeypatch.chdir(tmp_path)
+    options = [
+        "scene",
+        "--images",
+        "cache/rgba",
+        "--also",
+        "nir=cache/nir",
+        "--masks",
+        "ignore",
+        "--out",
+        "written",
+        "--layout",
+        "nerfstudio",
+    ]
+    written = CliRunner().invoke(app, ["export", *options])
+    assert written.exit_code == 0, written.output
+    told = json.loads(CliRunner().invoke(app, ["info", "written", "--json"]).stdout)
+    assert {name: sensor["frames"] for name, sensor in told["sensors"].items()} == {"rgb": 8, "nir": 8} and told["masks"] == "ignore"
+    assert CliRunner().invoke(app, ["fit", "written", "--steps", "2", "--json"]).exit_code == 0
+    said = CliRunner().invoke(app, ["export", "--images", "cache/rgba", "--layout", "colmap"])
+    assert said.exit_code == 2 and "expected them with a scene" in said.stderr and len(said.stderr.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -118,6 +118,19 @@ def test_a_sensor_beside_has_the_masks_of_the_pictures_that_it_matches(
     assert {frame.sensor for frame in scene.frames if frame.mask is not None} == masked
 
 
+def test_masks_that_are_named_and_not_there_are_said(write_transforms: Callable[..., Path]) -> None:
+    def with_masks(meta: dict) -> None:  # type: ignore[type-arg]
+        for index, frame in enumerate(meta["frames"]):
+            frame["mask_path"] = f"masks/{index}.png"
+
+    root = write_transforms(edit=with_masks)
+    _write(root / "masks/0.png")
+    scene = load_scene(root)
+    assert [frame.view for frame in scene.frames if frame.mask is not None] == [0]
+    (said,) = [problem for problem in scene.problems if "mask" in problem]
+    assert said.startswith("3 of 4 frames") and str(root / "masks/1.png") in said
+
+
 def test_bad_masks_are_one_sentence(write_mmsdata: Callable[..., Path], tmp_path: Path) -> None:
     scene = load_scene(write_mmsdata())
 

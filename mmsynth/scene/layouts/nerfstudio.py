@@ -119,6 +119,7 @@ def _frames(
     """Frames with an image, of the modalities whose sizes are given, by sensor and view; every pose in the list is checked."""
     frames: list[Frame] = []
     scaled = Resizes(str(path))
+    unmasked: list[Path] = []
     count: Counter[str] = Counter()  # of frames of the same modality before, with an image or without
     for index, frame in enumerate(listed):
         source = _source(frame)
@@ -134,9 +135,14 @@ def _frames(
         camera = scaled.fitted(camera, files[index])
         view = whole(frame, "view", where, 0, MAX_VIEW) if "view" in frame else position
         mask = path.parent / str(frame["mask_path"]) if "mask_path" in frame else None
-        mask = mask if mask is not None and is_file(mask) else None
+        if mask is not None and not is_file(mask):
+            unmasked, mask = [*unmasked, mask], None
         frames.append(Frame(names[source], view, files[index], camera, pose, source, mask))
     problems += scaled.problems()
+    if unmasked:
+        problems.append(
+            f"{len(unmasked)} of {len(frames)} frames name a mask that is not there, first: {unmasked[0]}; nothing is masked in them."
+        )
     order = list(dict.fromkeys(names[source] for source in sizes))
     frames.sort(key=lambda frame: (order.index(frame.sensor), frame.view))
     for one, two in itertools.pairwise(frames):
