@@ -32,7 +32,7 @@ from mmsynth.sensors.metrics import psnr_from_mse
 
 _GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
-_OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (0.3 dB in the masks at equal time)
+_OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (measured on one scene)
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
 
 
