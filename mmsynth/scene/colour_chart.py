@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mmsynth.scene.lattice import Lattice, mean_of_cell, to_pixels
+from mmsynth.scene.lattice import Lattice, mean_of_cell
 
 COLUMNS, ROWS = 6, 4
 # linear sRGB of the patches, row by row from dark skin to black: the maker's xyY (charts made after November 2014, D50 to D65 by
@@ -41,6 +41,8 @@ PATCHES = np.array(
     ]
 )
 _GREYS = slice(18, 24)
+_LEAST_SEEN = 12  # patches of a chart that the lattice was made of
+_BEYOND = 3  # columns that others may lie beyond it: as many as hold the other twelve
 _LEAST = 16  # patches, and greys, that are not clipped
 _LEAST_GREYS = 4
 _MISFIT = 0.05  # rms over channels of colours as they are displayed (1/2.2), white 1
@@ -50,11 +52,10 @@ _ROUNDS = 4  # of matrix and shading
 @dataclass(frozen=True)
 class ChartColours:
     """Attributes: matrix (3, 3): linear values to linear sRGB, green of a grey kept. spread: rms of what is left of the patches, as
-    displayed (values to the power of 1/2.2, white 1). corners (4, 2) px: middles of the patches at the chart's corners."""
+    displayed (values to the power of 1/2.2, white 1)."""
 
     matrix: np.ndarray
     spread: float
-    corners: np.ndarray
 
 
 def chart_colours(picture: np.ndarray, lattices: Sequence[Lattice]) -> ChartColours | None:
@@ -65,24 +66,21 @@ def chart_colours(picture: np.ndarray, lattices: Sequence[Lattice]) -> ChartColo
 
 def _chart_on(lattice: Lattice, picture: np.ndarray) -> ChartColours | None:
     best: ChartColours | None = None
-    low, high = lattice.cells.min(0), lattice.cells.max(0)
-    outer = {(int(i), int(j)) for i in range(low[0] - 5, high[0] + 6) for j in range(low[1] - 5, high[1] + 6)}
-    colours = {cell: mean_of_cell(picture, lattice, cell) for cell in sorted(outer)}
-    seen = {(int(i), int(j)) for i, j in lattice.cells}
+    low = lattice.cells.min(0) - _BEYOND
+    columns, rows = lattice.cells.max(0) + _BEYOND + 1 - low
+    seen = np.zeros((rows, columns), int)
+    seen[tuple((lattice.cells - low).T[::-1])] = 1
+    colours = np.array([[mean_of_cell(picture, lattice, low + (i, j)) for i in range(columns)] for j in range(rows)])
+    # a chart has no mirror image: its second axis lies to the right of its first as pixels do, whatever the lattice's
+    if np.linalg.det(_jacobian(lattice)) < 0:
+        seen, colours = seen[:, ::-1], colours[:, ::-1]
     for turn in range(4):
-        along = [np.array([1, 0]), np.array([0, 1]), np.array([-1, 0]), np.array([0, -1])][turn]
-        down = np.array([-along[1], along[0]])
-        # a chart has no mirror image: its second axis lies to the right of its first as pixels do, whatever the lattice's
-        down = down if np.linalg.det(_jacobian(lattice) @ np.stack([along, down], 1)) > 0 else -down
-        for start in sorted(outer):
-            grid = np.array(start) + np.arange(24)[:, None] % COLUMNS * along + np.arange(24)[:, None] // COLUMNS * down
-            cells = [(int(i), int(j)) for i, j in grid]
-            if len(seen.intersection(cells)) < 0.5 * len(cells) or not all(cell in colours for cell in cells):
-                continue
-            fitted = _fit(np.stack([colours[cell] for cell in cells]))
+        turned = np.rot90(colours, turn)
+        inside = np.lib.stride_tricks.sliding_window_view(np.rot90(seen, turn), (ROWS, COLUMNS)).sum((-1, -2))
+        for row, column in np.argwhere(inside >= _LEAST_SEEN):
+            fitted = _fit(turned[row : row + ROWS, column : column + COLUMNS].reshape(-1, 3))
             if fitted is not None and fitted[1] <= _MISFIT and (best is None or fitted[1] < best.spread):
-                corners, _ = to_pixels(lattice.to_pixels, np.array([cells[k] for k in (0, COLUMNS - 1, -1, -COLUMNS)]))
-                best = ChartColours(fitted[0], fitted[1], corners)
+                best = ChartColours(*fitted)
     return best
 
 

@@ -20,7 +20,7 @@ _NEAR = 0.22  # of the distance between two squares: how far one may lie from it
 _REACH = 7  # squares to each side of the first one
 _LEAST = 10  # squares that make a lattice
 _MIDDLE = 0.5  # of a square, in each direction, that is averaged
-_CLIPPED = 0.98  # of full scale
+CLIPPED = 0.98  # of full scale
 _LEAST_SIDE = 60  # pixels of a picture
 
 
@@ -72,10 +72,10 @@ def _even_patches(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _distinct(middles: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of patches seen at several thresholds the largest."""
     kept: list[int] = []
-    tree = KDTree(middles) if len(middles) else None
+    tree = KDTree(middles)
     left = np.ones(len(middles), bool)
     for i in np.argsort(-sides, kind="stable"):
-        if left[i] and tree is not None and len(kept) < _MOST:
+        if left[i] and len(kept) < _MOST:
             kept.append(int(i))
             left[tree.query_ball_point(middles[i], 0.3 * sides[i])] = False
     return middles[kept], sides[kept]
@@ -122,7 +122,7 @@ def _grow(first: np.ndarray, u: np.ndarray, v: np.ndarray, middles: np.ndarray, 
         places, pitch = to_pixels(matrix, ring)
         away, nearest = tree.query(places)
         near = away < _NEAR * pitch
-        if near.sum() < min(4, 2 * reach + 2) or (reach > 1 and near.sum() == len(cells)):
+        if near.sum() < 4 or (reach > 1 and near.sum() == len(cells)):
             break
         cells = ring[near]
         fitted, _ = cv2.findHomography(cells.astype(np.float64), middles[nearest[near]])
@@ -143,9 +143,9 @@ def to_pixels(matrix: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.nda
     return places, np.where(front, np.minimum(*along), 0.0)
 
 
-def mean_of_cell(picture: np.ndarray, lattice: Lattice, cell: tuple[int, int]) -> np.ndarray:
-    """Mean (C,) of the middle of a square in a picture (H, W, C), full scale 1; NaN outside the picture and where it is clipped."""
-    outline = np.array(cell) + _MIDDLE / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+def mean_of_cell(picture: np.ndarray, lattice: Lattice, cell: np.ndarray) -> np.ndarray:
+    """Mean (C,) of the middle of a square (2,), by column and row, in a picture (H, W, C), full scale 1; NaN outside and where clipped."""
+    outline = cell + _MIDDLE / 2 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     pixels, pitch = to_pixels(lattice.to_pixels, outline)
     height, width = picture.shape[:2]
     low, high = np.floor(pixels.min(0)).astype(int), np.ceil(pixels.max(0)).astype(int) + 1
@@ -155,4 +155,4 @@ def mean_of_cell(picture: np.ndarray, lattice: Lattice, cell: tuple[int, int]) -
     inside = np.zeros(window.shape[:2], np.uint8)
     cv2.fillConvexPoly(inside, np.round(pixels - low).astype(np.int32), 1)
     values = window[inside > 0]
-    return np.asarray(values.mean(0)) if values.max() < _CLIPPED else np.full(picture.shape[2], np.nan)
+    return np.asarray(values.mean(0)) if values.max() < CLIPPED else np.full(picture.shape[2], np.nan)

@@ -18,7 +18,7 @@ from mmsynth.scene.capture.boards import markers_in
 from mmsynth.scene.colour_chart import ChartColours, chart_colours
 from mmsynth.scene.encoding import encoding_of
 from mmsynth.scene.images import read_native
-from mmsynth.scene.lattice import Lattice, find_lattices, mean_of_cell
+from mmsynth.scene.lattice import CLIPPED, Lattice, find_lattices, mean_of_cell
 from mmsynth.scene.scene import Frame, Sensor
 
 _FRAMES, _LEAST = 6, 6  # that are looked at; black and white of a board that must agree
@@ -114,7 +114,7 @@ def _steps_of_markers(picture: np.ndarray) -> list[np.ndarray]:
         low, high = np.quantile(level, (0.1, 0.9))
         white, black = pixels[level >= high], pixels[level <= low]
         step = white.mean(0) - black.mean(0)
-        if white.max() < 0.98 and low < _DARK * high and step.min() > _STEP:
+        if white.max() < CLIPPED and low < _DARK * high and step.min() > _STEP:
             steps.append(step)
     return steps
 
@@ -124,7 +124,7 @@ def _steps_of_squares(picture: np.ndarray, lattices: Sequence[Lattice]) -> list[
     if not lattices:
         return []
     lattice = lattices[0]
-    colours = {(int(i), int(j)): mean_of_cell(picture, lattice, (int(i), int(j))) for i, j in lattice.cells}
+    colours = {(int(cell[0]), int(cell[1])): mean_of_cell(picture, lattice, cell) for cell in lattice.cells}
     colours = {cell: colour for cell, colour in colours.items() if np.isfinite(colour).all()}
     sides = [[float(colour.mean()) for cell, colour in colours.items() if sum(cell) % 2 == side] for side in (0, 1)]
     if min(map(len, sides)) < _LEAST:

@@ -136,7 +136,8 @@ def _frames(
         view = whole(frame, "view", where, 0, MAX_VIEW) if "view" in frame else position
         mask = path.parent / str(frame["mask_path"]) if "mask_path" in frame else None
         if mask is not None and not is_file(mask):
-            unmasked, mask = [*unmasked, mask], None
+            unmasked.append(mask)
+            mask = None
         frames.append(Frame(names[source], view, files[index], camera, pose, source, mask))
     problems += scaled.problems()
     if unmasked:
