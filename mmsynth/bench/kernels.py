@@ -138,7 +138,8 @@ def _trace(backend: Any) -> Callable[[Inputs], Outputs]:
     def trace(x: Inputs) -> Outputs:
         tables = *x["surface"].at(_LEVELS[0]), x["appearance"].at(_LEVELS[1])
         hits = backend.trace(*tables, x["occupancy"].states, _rays_of(x), _SAMPLING)
-        return torch.cat([hits.features, hits.opacity[:, None]], 1), hits.samples
+        nearest = hits.features[: len(hits.opacity)]
+        return torch.cat([nearest, hits.opacity[:, None]], 1), hits.samples
 
     return trace
 
@@ -159,10 +160,11 @@ def _compare_inputs(samples: int) -> Inputs:
         shader = Shader(_field()["appearance"].width, 64, sensors, {"rgb": 1.0, "pol": 1.0})
     output = torch.cat([torch.randint(3, (samples - tensors,), generator=g), torch.full((tensors,), 3)])
     unit = lambda count: nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
-    values = {name: torch.rand(samples, generator=g) for name in ("opacity", "target")}
+    values = {name: torch.rand(samples, generator=g) for name in ("share", "target")}
     constants = {name: torch.full((samples,), value) for name, value in (("level", 1.0), ("saturation", 0.9), ("weight", 1 / samples))}
     return {
-        "shader": shader, "features": torch.randn(samples, _field()["appearance"].width, generator=g), "directions": unit(samples),
+        "shader": shader, "features": torch.randn(samples, _field()["appearance"].width, generator=g),
+        "behind": torch.full((samples,), -1), "directions": unit(samples),
         "degrees": torch.full((samples,), 3), "trains_geometry": torch.ones(samples, dtype=torch.bool), "ray": torch.arange(samples),
         "output": output, "axes": unit(tensors), **values, **constants,
     }  # fmt: skip

@@ -14,6 +14,7 @@ from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
+from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
@@ -156,13 +157,16 @@ class Field(nn.Module):
         unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
 
-    def with_far_light(self, hits: rendering.Hits) -> tuple[Tensor, Tensor]:
-        """Features (R, F) and opacity (R,) of what is shaded. Light from beyond the region has features, too, and no place: only a
-        direction; where it is modelled, no ray ends in the dark."""
+    def with_far_light(self, hits: rendering.Hits) -> rendering.Hits:
+        """What is shaded. Light from beyond the region has features, too, and no place: only a direction; it is mixed into the last surface
+        of each ray. Where it is modelled, no ray ends in the dark."""
         if self.far_light is None:
-            return hits.features, hits.opacity
-        passed = (1.0 - hits.opacity)[:, None]
-        return hits.opacity[:, None] * hits.features + passed * self.far_light, torch.ones_like(hits.opacity)
+            return hits
+        last = torch.where(hits.behind >= 0, hits.behind, torch.arange(len(hits.behind), device=hits.behind.device))
+        passed = torch.zeros_like(hits.share).index_add(0, last, 1.0 - hits.opacity)
+        share = hits.share + passed
+        mixed = (passed / share.clamp(min=LEAST_WEIGHT))[:, None]
+        return hits._replace(features=torch.lerp(hits.features, self.far_light.expand_as(hits.features), mixed), share=share)
 
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
@@ -188,9 +192,15 @@ class Field(nn.Module):
         self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
-        features, opacity = self.with_far_light(hits)
-        opacity = opacity[:, None]
-        outputs = {d: self.shader(features, directions, d) for d in {self.view_dependence[n] for n in modalities}}
+        shaded = self.with_far_light(hits)
+        ray = kernels.rays_of(shaded.behind)
+        outputs = {d: self.shader(shaded.features, directions[ray], d) for d in {self.view_dependence[n] for n in modalities}}
+
+        def together(light: Tensor) -> Tensor:
+            """Of the surfaces that a ray meets, (H, C) → (R, C)."""
+            seen = shaded.share[:, None] * light
+            return seen[: len(directions)].index_add(0, ray[len(directions) :], seen[len(directions) :])
+
         # a background is opaque, too, but what lies there is not the object
         reached = torch.linalg.vector_norm(origins + directions * hits.depth[:, None], dim=-1)
         within = torch.isnan(hits.depth) | (reached <= _WITHIN)
@@ -199,12 +209,12 @@ class Field(nn.Module):
         for name in modalities:
             angles = self.sensors[name].polarizer_angles_deg
             if angles is None:
-                out[name] = opacity * self.shader.values(name, outputs[self.view_dependence[name]])
+                out[name] = together(self.shader.values(name, outputs[self.view_dependence[name]]))
                 continue
-            x, y = reference_axes(directions, camera_x)
+            x, y = (axis[ray] for axis in reference_axes(directions, camera_x))
             turned = torch.deg2rad(torch.tensor(angles, device=origins.device))
             light = self.shader.polarized(name, outputs[self.view_dependence[name]], x, y, turned)
-            out[name], out[f"stokes/{name}"] = (opacity * part for part in light)
+            out[name], out[f"stokes/{name}"] = map(together, light)
         if geometry:
             depth = hits.depth
             hit = torch.nonzero(torch.isfinite(depth))[:, 0]

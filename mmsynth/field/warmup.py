@@ -42,7 +42,7 @@ def run_kernels() -> None:
         hits = trace(surface, appearance, Occupancy(4), origins, directions, torch.zeros(1), kernels.Sampling(20.0, 0.1, 1, 1))
         weights = Shader(4, 4, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}).weights()
         one, index = torch.ones(1), torch.zeros(1, dtype=torch.int64)
-        rays = kernels.ShadedRays(hits.features, hits.opacity, directions, index, index == 0)
+        rays = kernels.ShadedRays(hits.features, hits.share, hits.behind, directions, index, index == 0)
         loss, _ = kernels.compare(weights, rays, kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one))
         (loss + surface(origins.detach(), 1).sum()).backward()
     with torch.no_grad():

@@ -47,10 +47,11 @@ def decide(field: Field, measurements: dict[str, Measurements], recipe: Radiance
     batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random, field.device)
     jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-    outputs = field.shader(hits.features, batch.directions, batch.per_ray(field.view_dependence))
-    predicted = kernels.predict(outputs, hits.opacity, batch.measured)
+    ray = kernels.rays_of(hits.behind)
+    outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
+    predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind)
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, hits.features, hits.opacity, batch)
+        errors = errors_by_degree(field.shader, hits, batch)
         degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in batch.parts}
     else:
         asked = recipe.view_dependence
@@ -78,7 +79,7 @@ def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measureme
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
-def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: Batch) -> dict[str, list[float]]:
+def errors_by_degree(shader: Shader, hits: kernels.Hits, batch: Batch) -> dict[str, list[float]]:
     """Mean squared error of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
 
     Copies of the shader, one per degree, go on learning for some steps from the rays of even number, geometry and appearance
@@ -86,11 +87,11 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
     taken from it would not tell: it uses what it is given, needed or not.)
 
     Args:
-        features: (R, F). opacity: (R,). batch: the R rays and what was measured along them.
+        hits: of the R rays. batch: these rays, and what was measured along them.
     Returns:
         by modality; NaN where every number is clipped.
     """
-    learned = batch.measured.ray % 2 == 0
+    learned, directions = batch.measured.ray % 2 == 0, batch.directions[kernels.rays_of(hits.behind)]
     usable = batch.measured.target < batch.measured.saturation
     out: dict[str, list[float]] = {name: [] for name in batch.parts}
     for degree in range(DEGREES + 1):
@@ -99,7 +100,7 @@ def errors_by_degree(shader: Shader, features: Tensor, opacity: Tensor, batch: B
         optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
         for step in range(_STEPS + 1):
             with torch.enable_grad():
-                predicted = kernels.predict(candidate(features, batch.directions, degree), opacity, batch.measured)
+                predicted = kernels.predict(candidate(hits.features, directions, degree), hits.share, batch.measured, hits.behind)
                 difference = kernels.residual(predicted, batch.measured)
                 if step < _STEPS:
                     kernels.photometric(difference * learned, batch.measured).backward()

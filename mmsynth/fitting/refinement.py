@@ -56,8 +56,10 @@ def ray_residuals(
     try:
         with torch.enable_grad():
             hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
-            features, opacity = field.with_far_light(hits) if far_light else (hits.features, hits.opacity)
-            predicted = kernels.predict(field.shader(features, directions, degrees), opacity, batch.measured)
+            hits = field.with_far_light(hits) if far_light else hits
+            ray = kernels.rays_of(hits.behind)
+            outputs = field.shader(hits.features, directions[ray], degrees[ray])
+            predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind)
             relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.measured.level
             mean = torch.zeros_like(middle).index_add(0, batch.measured.ray, relative) / torch.bincount(
                 batch.measured.ray, minlength=len(origins)

@@ -224,8 +224,9 @@ class Trainer:
         trains_geometry = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
         gain = self._gain_of(batch)
         # light from beyond the region would explain what is in it as long as that has no shape
-        shaded = field.with_far_light(hits) if self.state.decided is not None else (hits.features, hits.opacity)
-        loss, squared = losses.compare(field.shader, *shaded, batch, degrees, trains_geometry, gain)
+        shaded = field.with_far_light(hits) if self.state.decided is not None else hits
+        rays = kernels.ShadedRays(shaded.features, shaded.share, shaded.behind, batch.directions, degrees, trains_geometry)
+        loss, squared = kernels.compare(field.shader.weights(), rays, batch.measured, gain)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)

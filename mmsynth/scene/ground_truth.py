@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mmsynth.errors import InputError
+from mmsynth.files import read_json
 from mmsynth.scene.images import read_npz
 from mmsynth.scene.scene import Frame, Scene, canonical_modality
 
@@ -32,6 +34,14 @@ class GroundTruth:
     def geometry(self, view: int) -> dict[str, np.ndarray] | None:
         """(H, W, ...) at the pose of the RGB frame: depth_z, normal, in_roi, ..."""
         return self.arrays("geometry", f"{view:04d}.npz")
+
+    def labels(self) -> dict[str, str]:
+        """Names of the labels in ``geometry``, by number."""
+        path = self.folder / "labels.json"
+        found = read_json(path) if path.is_file() else {}
+        if not isinstance(found, dict) or not all(key.isdecimal() and isinstance(name, str) for key, name in found.items()):
+            raise InputError(f"{path}: expected an object of label numbers and their names.")
+        return found
 
     def aligned(self, view: int) -> dict[str, np.ndarray]:
         """Light (H, W, C) of all modalities at the pose of the RGB frame, by canonical modality name."""

@@ -175,8 +175,9 @@ SAMPLINGS = {
 }
 # what float32 leaves: most is lost in gradients that are sums of large numbers of both signs
 TOLERANCES = {
-    "features": 1e-4, "opacity": 5e-5, "depth": 2e-6, "gradient of the surface's table": 2e-4, "gradient of the appearance": 4e-5,
-    "gradient of hidden": 1.5e-4, "gradient of last": 1e-4, "gradient of origins": 2e-4, "gradient of directions": 2e-4,
+    "features": 1e-4, "share": 5e-5, "opacity": 5e-5, "depth": 2e-6, "gradient of the surface's table": 2e-4,
+    "gradient of the appearance": 4e-5, "gradient of hidden": 1.5e-4, "gradient of last": 1e-4, "gradient of origins": 2e-4,
+    "gradient of directions": 2e-4,
 }  # fmt: skip
 
 
@@ -226,13 +227,23 @@ def _quantities(
         module.zero_grad()
     hits = rendering.trace(surface, appearance, occupancy, origins, directions, jitter, sampling)
     weight = torch.linspace(0.5, 1.5, len(origins)).to(jitter)
-    ((hits.features * weight[:, None]).square().sum() + (hits.opacity * weight).square().sum()).backward()
+    of_row = weight[reference.rays_of(hits.behind)]
+    loss = (hits.features * of_row[:, None]).square().sum() + (hits.opacity * weight).square().sum()
+    (loss + 0.5 * (hits.share * of_row).square().sum()).backward()
     return {
-        "features": hits.features, "opacity": hits.opacity, "depth": hits.depth / (1 + hits.depth),
+        "features": _per_ray(hits, hits.features), "share": _per_ray(hits, hits.share[:, None]),
+        "opacity": hits.opacity, "depth": hits.depth / (1 + hits.depth),
         "gradient of the surface's table": surface.grid.table.grad, "gradient of the appearance": appearance.table.grad,
         "gradient of hidden": surface.hidden.grad, "gradient of last": surface.output_weight.grad,
         "gradient of origins": origins.grad, "gradient of directions": directions.grad,
     }, hits  # fmt: skip
+
+
+def _per_ray(hits: rendering.Hits, rows: torch.Tensor) -> torch.Tensor:
+    """(H, C) → (R, 2 C): of the nearest surface of each ray and of what is behind it, 0 where nothing is."""
+    out = rows.detach().new_zeros(2, len(hits.behind), rows.shape[1])
+    out[0], out[1, hits.behind >= 0] = rows.detach()[: len(hits.behind)], rows.detach()[len(hits.behind) :]
+    return torch.cat([out[0], out[1]], 1)
 
 
 Rays = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -244,7 +255,7 @@ def _smooth(parts: Parts, rays: Rays, sampling: Sampling) -> torch.Tensor:
     shift = 1e-5 * torch.randn(origins.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     below, here, above = (_quantities(parts, origins + k * shift, directions, jitter, sampling, exact=True)[0] for k in (-1, 0, 1))
     keep = torch.ones(len(origins), dtype=torch.bool)
-    for name in ("features", "opacity", "depth", "gradient of origins"):
+    for name in ("features", "share", "opacity", "depth", "gradient of origins"):
         a, b, c = (x[name].detach().reshape(len(origins), -1) for x in (below, here, above))
         keep &= ((a.isnan() == b.isnan()) & (b.isnan() == c.isnan())).all(1)
         keep &= (a - 2 * b + c).nan_to_num().abs().amax(1) < 1e-4 * b.nan_to_num().abs().max()
@@ -283,8 +294,10 @@ def test_trace(extent: float, states: str, sampling: str) -> None:
     near, far = rendering.ball_interval(rays[0].detach(), rays[1].detach())
     assert (near == 0).sum() > 30 and (near == far).sum() > 20  # rays from within, rays that miss the ball
     nothing = hits.opacity == 0
-    assert hits.depth[nothing].isnan().all() and not hits.features[nothing].any()
+    assert hits.depth[nothing].isnan().all() and not hits.features[: len(nothing)][nothing].any()
     assert (hits.opacity > 0.7).sum() > 100 and (extent > 1.0 or nothing.any())
+    twice = hits.behind >= 0
+    assert torch.equal(hits.behind[twice], torch.arange(len(twice), len(hits.features))) and (twice.any() or sampling != "hard")
     if sampling == "slow" and states == "open":
         assert int(hits.samples) > 60 * len(hits.opacity)
 
@@ -324,7 +337,7 @@ def test_a_trace_is_the_same_without_a_gradient() -> None:
         second = rendering.trace(*parts, *(x.detach() for x in rays), SAMPLINGS["soft"])
         for hits in (first, second):
             assert not hits.features.requires_grad and int(hits.samples) == int(kept.samples)
-            for name in ("features", "opacity", "depth"):
+            for name in ("features", "share", "behind", "opacity", "depth"):
                 assert torch.equal(getattr(hits, name).nan_to_num(), getattr(kept, name).nan_to_num()), name
 
 

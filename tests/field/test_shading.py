@@ -15,10 +15,10 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from mmsynth.field.kernels import Measured, cpu, reference
+from mmsynth.field import kernels
+from mmsynth.field.kernels import Measured, ShadedRays, cpu, reference
 from mmsynth.field.kernels.cpu import shading as cpu_shading
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting import losses
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
 
@@ -45,7 +45,8 @@ class Case:
 
     shader: Shader
     features: torch.Tensor
-    opacity: torch.Tensor
+    share: torch.Tensor
+    behind: torch.Tensor
     batch: Batch
     degrees: torch.Tensor
     trains_geometry: torch.Tensor
@@ -94,19 +95,23 @@ def _case(count: int, modalities: tuple[Modality, ...] = ALL, width: int = 24, h
             lists[key].append(torch.full((numbers,), value))
     joined = {k: torch.cat(v) for k, v in lists.items()}
     frame, alpha = torch.zeros_like(joined["ray"]), torch.full((rays,), torch.nan)
-    directions, opacity = normalize(torch.randn(rays, 3), dim=1), torch.rand(rays)
-    opacity[torch.rand(rays) < 0.2] = 0.0
+    directions = normalize(torch.randn(rays, 3), dim=1)
+    twice = torch.nonzero(torch.rand(rays) < 0.3)[:, 0]
+    behind = torch.full((rays,), -1)
+    behind[twice] = torch.arange(rays, rays + len(twice))
+    share = torch.rand(rays + len(twice))
+    share[:rays][torch.rand(rays) < 0.2] = 0.0
     batch = Batch(
         origins=torch.zeros(rays, 3), directions=directions, frame=frame, parts=parts, alpha=alpha,
         measured=Measured(**joined, axes=torch.cat(axes) if axes else torch.empty(0, 3)),
     )  # fmt: skip
     gain = torch.rand(len(joined["ray"])) + 0.5 if gains else None
-    return Case(shader, torch.randn(rays, width), opacity, batch, torch.randint(4, (rays,)), torch.rand(rays) < 0.8, gain)
+    return Case(shader, torch.randn(len(share), width), share, behind, batch, torch.randint(4, (rays,)), torch.rand(rays) < 0.8, gain)
 
 
 def _quantities(case: Case) -> dict[str, torch.Tensor]:
     """Loss, squared residuals, and gradients of three times the loss."""
-    inputs = {name: x for name in ("features", "opacity", "gain") if (x := getattr(case, name)) is not None}
+    inputs = {name: x for name in ("features", "share", "gain") if (x := getattr(case, name)) is not None}
     for x in (*inputs.values(), *case.shader.parameters()):
         x.requires_grad_().grad = None
     loss, squared = _compare(case)
@@ -117,7 +122,8 @@ def _quantities(case: Case) -> dict[str, torch.Tensor]:
 
 
 def _compare(case: Case) -> tuple[torch.Tensor, torch.Tensor]:
-    return losses.compare(case.shader, case.features, case.opacity, case.batch, case.degrees, case.trains_geometry, case.gain)
+    rays = ShadedRays(case.features, case.share, case.behind, case.batch.directions, case.degrees, case.trains_geometry)
+    return kernels.compare(case.shader.weights(), rays, case.batch.measured, case.gain)
 
 
 def _check(case: Case) -> dict[str, torch.Tensor]:
@@ -142,8 +148,11 @@ def test_compare(count: int) -> None:
         clipped = case.batch.measured.target >= case.batch.measured.saturation
         assert 0.1 < clipped.float().mean() < 0.5 and (found["squared"][clipped] == 0).any()
         assert (found["squared"].sqrt() > 0.5 * case.batch.measured.level).any()  # the linear part of the loss, too
-        for name in ("features", "opacity"):
-            assert not found[f"gradient of {name}"][~case.trains_geometry].any() and found[f"gradient of {name}"].any()
+        for name in ("features", "share"):
+            assert (
+                not found[f"gradient of {name}"][~case.trains_geometry[kernels.rays_of(case.behind)]].any()
+                and found[f"gradient of {name}"].any()
+            )
 
 
 @pytest.mark.parametrize("modalities", [(FILM,), (TENSOR,), (MOSAIC, FILM), (ANALYSERS, TENSOR)])
@@ -192,9 +201,9 @@ def test_outputs_far_from_zero(raw: float) -> None:
 
 def test_rays_that_miss_everything() -> None:
     case = _case(50)
-    case.opacity[:] = 0.0
+    case.share[:] = 0.0
     found = _check(case)
-    assert found["gradient of opacity"].any() and not found["gradient of features"].any()
+    assert found["gradient of share"].any() and not found["gradient of features"].any()
 
 
 def test_clipped_pixels_that_are_bright_enough_ask_for_nothing() -> None:
@@ -206,7 +215,7 @@ def test_clipped_pixels_that_are_bright_enough_ask_for_nothing() -> None:
 
 
 def test_what_is_not_a_number_is_seen_in_the_loss() -> None:
-    for name, value in (("features", torch.nan), ("opacity", torch.nan), ("gain", torch.nan), ("features", torch.inf)):
+    for name, value in (("features", torch.nan), ("share", torch.nan), ("gain", torch.nan), ("features", torch.inf)):
         case = _case(50)
         getattr(case, name)[70] = value
         assert not torch.isfinite(_compare(case)[0]), name
@@ -228,7 +237,7 @@ def test_a_loss_is_the_same_without_a_gradient() -> None:
     with torch.no_grad():
         first = _compare(case)
     case.shader.requires_grad_(False)
-    second = _compare(dataclasses.replace(case, features=case.features.detach(), opacity=case.opacity.detach(), gain=case.gain.detach()))
+    second = _compare(dataclasses.replace(case, features=case.features.detach(), share=case.share.detach(), gain=case.gain.detach()))
     for loss, squared in (first, second):
         assert not loss.requires_grad
         assert torch.equal(loss, expected["loss"]) and torch.equal(squared, expected["squared"])

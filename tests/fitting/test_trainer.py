@@ -16,11 +16,11 @@ import torch
 from conftest import ring
 
 from mmsynth.errors import DivergedError, InputError
+from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
 from mmsynth.field.storage import load_field
 from mmsynth.field.surface import Surface
-from mmsynth.fitting import losses
 from mmsynth.fitting import run as run_module
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.device import pick_device
@@ -340,14 +340,14 @@ def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str) -
 
 def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    compare = losses.compare
+    compare = kernels.compare
 
     def sometimes(*args: Any) -> tuple[torch.Tensor, torch.Tensor]:
         calls.append(1)
         loss, squared = compare(*args)
         return loss * (torch.nan if len(calls) in (1, 4) else 1.0), squared
 
-    monkeypatch.setattr(losses, "compare", sometimes)
+    monkeypatch.setattr(kernels, "compare", sometimes)
     news: list[FitProgress] = []
     field = fit(scene, tmp_path, recipe=SMALL, steps=6, on_step=news.append)
     assert field.manifest["skipped_steps"] == 2 and field.manifest["steps"] == 6

@@ -51,7 +51,7 @@ def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
     for _ in range(2):
         tables = *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance)
         hits = reference.trace(*tables, field.occupancy.states, Rays(o, d, *ball_interval(o, d), zero), sampling)
-        shaded = ShadedRays(hits.features, hits.opacity, d, zero.long(), zero == 0)
+        shaded = ShadedRays(hits.features, hits.share, hits.behind, d, zero.long(), zero == 0)
         loss, squared = reference.compare(field.shader.weights(), shaded, batch.measured)
         lost.append(float(squared.isnan().float().mean()))
         loss.backward()

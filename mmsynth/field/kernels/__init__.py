@@ -18,13 +18,13 @@ from torch import Tensor
 from mmsynth.field.kernels import cpu, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.parameters import GridTable, Hits, Measured, Rays, Samples, Sampling, ShadedRays, ShaderWeights, SurfaceNetwork
-from mmsynth.field.kernels.reference import contract, contracted_velocity, intensity, photometric, predict, radiance, residual
+from mmsynth.field.kernels.reference import contract, contracted_velocity, intensity, photometric, predict, radiance, rays_of, residual
 
 __all__ = [
     "OUTSIDE", "SHELL", "SOLID",
     "GridTable", "Hits", "Measured", "Rays", "Samples", "Sampling", "ShadedRays", "ShaderWeights", "SurfaceNetwork",
     "adam", "compare", "contract", "contracted_velocity", "hash_encode", "intensity", "march", "photometric", "predict", "radiance",
-    "residual", "section_weights", "shade", "surface_value", "trace",
+    "rays_of", "residual", "section_weights", "shade", "surface_value", "trace",
 ]  # fmt: skip
 
 

@@ -91,10 +91,20 @@ class Samples(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What R rays meet: features (R, F), the mean over the hit; opacity (R,) in [0, 1]; depth (R,), the ray distance at which
-    half of the light is met, NaN = no hit; samples: how many were taken, a number."""
+    """What R rays meet: a surface each, and where that covers a pixel in part, at silhouettes and thin parts, what is behind it.
+
+    A row is one surface on one ray: the nearest of each ray, in the order of the rays, and then those behind them, H in all.
+
+    Attributes:
+        features: (H, F), the mean over the surface. share: (H,), of the light of its ray. behind: (R,) int64, the row of what is
+            behind the nearest surface, -1 = nothing; ascending.
+        opacity: (R,) in [0, 1], the sum of the shares. depth: (R,), the ray distance at which half of the light is met, NaN = no hit.
+        samples: how many were taken, a number.
+    """
 
     features: Tensor
+    share: Tensor
+    behind: Tensor
     opacity: Tensor
     depth: Tensor
     samples: Tensor
@@ -104,12 +114,14 @@ class ShadedRays(NamedTuple):
     """What the shader is given of R rays.
 
     Attributes:
-        features: (R, F). opacity: (R,). directions: (R, 3), unit. degrees: (R,) int64, of the harmonics of direction that are seen.
-        trains_geometry: (R,) bool; the others pass gradients on to the heads alone, not to features, opacity and hidden layers.
+        features, share, behind: of what they meet, see ``Hits``. directions: (R, 3), unit.
+        degrees: (R,) int64, of the harmonics of direction that are seen.
+        trains_geometry: (R,) bool; the others pass gradients on to the heads alone, not to features, shares and hidden layers.
     """
 
     features: Tensor
-    opacity: Tensor
+    share: Tensor
+    behind: Tensor
     directions: Tensor
     degrees: Tensor
     trains_geometry: Tensor

@@ -17,6 +17,7 @@ from mmsynth.field.kernels.constants import (
     FACE_OVERSHOOT,
     HASH_PRIMES,
     HUBER_DELTA,
+    LAYER_GAP,
     LEAST_ADVANCE,
     LEAST_WEIGHT,
     LONGEST_STEP,
@@ -251,7 +252,8 @@ def composite(
 ) -> Hits:  # fmt: skip
     """Evaluate, weigh and composite the samples of R rays.
 
-    Appearance is looked up where each section crosses the surface, once per section that matters; it is shaded once per ray.
+    Appearance is looked up where each section crosses the surface, once per section that matters; it is shaded once per surface that a ray
+    meets, and these are two at the most: what is behind a gap of ``LAYER_GAP`` is apart from what is before it.
     """
     t, ray, offsets = samples
     count = len(rays.origins)
@@ -272,11 +274,30 @@ def composite(
     chosen = torch.nonzero(weights.detach() > sampling.min_section_weight)[:, 0]
     following = (chosen + 1).clamp(max=max(len(t) - 1, 0))
     at, w = ray[chosen], weights[chosen]
-    encoded = encode(position(at, torch.lerp(t[chosen], t[following], crossing[chosen])), appearance, hash_encode)
-    shown = w.new_zeros(count).index_add(0, at, w)
-    features = torch.zeros(count, encoded.shape[1], dtype=w.dtype, device=w.device).index_add(0, at, w[:, None] * encoded)
+    crossings = position(at, torch.lerp(t[chosen], t[following], crossing[chosen]))
+    encoded = encode(crossings, appearance, hash_encode)
+    second = _second_surface(crossings.detach(), at, chosen, LAYER_GAP / sampling.sharpness, count, len(t))
+    behind = torch.full_like(second, -1)
+    met_twice = torch.nonzero(second < len(t))[:, 0]
+    behind[met_twice] = torch.arange(count, count + len(met_twice), device=second.device)
+    rows = count + len(met_twice)
+    row = torch.where(torch.arange(len(t), device=ray.device) < second[ray], ray, behind[ray])
+    share = w.new_zeros(rows).index_add(0, row, weights)
+    shown = w.new_zeros(rows).index_add(0, row[chosen], w)
+    features = torch.zeros(rows, encoded.shape[1], dtype=w.dtype, device=w.device).index_add(0, row[chosen], w[:, None] * encoded)
     depth = _median_depth(t, weights.detach(), before, crossing, ray, count)
-    return Hits(features / shown.clamp(min=LEAST_WEIGHT)[:, None], opacity, depth, torch.tensor(len(t)))
+    return Hits(features / shown.clamp(min=LEAST_WEIGHT)[:, None], share, behind, opacity, depth, torch.tensor(len(t)))
+
+
+def _second_surface(crossings: Tensor, ray: Tensor, section: Tensor, gap: float, rays: int, none: int) -> Tensor:
+    """The section with which the second surface of each ray begins, (rays,), ``none`` where there is one at the most.
+
+    Args:
+        crossings: (K, 3) of sections that matter, in the grid's frame. ray, section: (K,) indices.
+    """
+    apart = torch.linalg.vector_norm(crossings[1:] - crossings[:-1], dim=-1) > gap
+    begins = torch.nonzero(apart & (ray[1:] == ray[:-1]))[:, 0] + 1
+    return torch.full((rays,), none, device=ray.device).scatter_reduce(0, ray[begins], section[begins], "amin")
 
 
 def _median_depth(t: Tensor, weights: Tensor, before: Tensor, crossing: Tensor, ray: Tensor, rays: int) -> Tensor:
@@ -330,10 +351,12 @@ def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: 
     Returns:
         The photometric loss, a scalar, and the squared residual of every measurement, (M,), without a gradient.
     """
-    hidden = hidden_layers(weights, rays.features, rays.directions, rays.degrees)
-    hidden = torch.where(rays.trains_geometry[:, None], hidden, hidden.detach())
-    opacity = torch.where(rays.trains_geometry, rays.opacity, rays.opacity.detach())
-    predicted = predict(linear(hidden, weights.heads, weights.heads_bias), opacity, measured)
+    ray = rays_of(rays.behind)
+    trains = rays.trains_geometry[ray]
+    hidden = hidden_layers(weights, rays.features, rays.directions[ray], rays.degrees[ray])
+    hidden = torch.where(trains[:, None], hidden, hidden.detach())
+    share = torch.where(trains, rays.share, rays.share.detach())
+    predicted = predict(linear(hidden, weights.heads, weights.heads_bias), share, measured, rays.behind)
     difference = residual(predicted if gain is None else predicted * gain, measured)
     return photometric(difference, measured), difference.detach().square()
 
@@ -349,14 +372,35 @@ def intensity(raw: Tensor, axes: Tensor) -> Tensor:
     return (coherency_from_factor(raw).mT @ axes[..., None])[..., 0].square().sum(-1)
 
 
-def predict(outputs: Tensor, opacity: Tensor, measured: Measured) -> Tensor:
-    """What the sensors should have measured: shader outputs (R, outputs) and opacity (R,) → (M,)."""
-    bright = len(measured.ray) - len(measured.axes)
-    value = radiance(outputs[measured.ray[:bright], measured.output[:bright]])
-    if len(measured.axes):
-        factor = measured.output[bright:, None] + torch.arange(6, device=outputs.device)
-        value = torch.cat([value, intensity(outputs[measured.ray[bright:, None], factor], measured.axes)])
-    return value * measured.level * opacity[measured.ray]
+def rays_of(behind: Tensor) -> Tensor:
+    """The ray of each row of ``Hits``: (R,) rows of what is behind → (H,)."""
+    return torch.cat([torch.arange(len(behind), device=behind.device), torch.nonzero(behind >= 0)[:, 0]])
+
+
+def predict(outputs: Tensor, share: Tensor, measured: Measured, behind: Tensor | None = None) -> Tensor:
+    """What the sensors should have measured: shader outputs (H, outputs) and shares (H,) → (M,).
+
+    Args:
+        behind: (R,), see ``Hits``; None: rays meet one surface each.
+    """
+    seen = _relative(outputs, share, measured.ray, measured.output, measured.axes)
+    if behind is not None:
+        row = behind[measured.ray]
+        chosen = torch.nonzero(row >= 0)[:, 0]
+        bright = len(measured.ray) - len(measured.axes)
+        axes = measured.axes[chosen[chosen >= bright] - bright]
+        seen = seen.index_add(0, chosen, _relative(outputs, share, row[chosen], measured.output[chosen], axes))
+    return seen * measured.level
+
+
+def _relative(outputs: Tensor, share: Tensor, row: Tensor, output: Tensor, axes: Tensor) -> Tensor:
+    """Relative light of one row for each number, (M,)."""
+    bright = len(row) - len(axes)
+    value = radiance(outputs[row[:bright], output[:bright]])
+    if len(axes):
+        factor = output[bright:, None] + torch.arange(6, device=outputs.device)
+        value = torch.cat([value, intensity(outputs[row[bright:, None], factor], axes)])
+    return value * share[row]
 
 
 def residual(predicted: Tensor, measured: Measured) -> Tensor:

@@ -14,6 +14,7 @@ averaged per view in dB):
 * ``psnr_truth``, ``psnr_truth_full``: all channels at every pixel of the own pose against ``gt/<modality>``, in the region and
   everywhere; both clipped to [0, 1], the range that frames can record.
 * ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
+* ``psnr_highlights, psnr_silhouettes, psnr_rest``: of ``psnr_aligned``, its parts (see ``parts``), where ``gt/geometry`` tells them.
 * ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``dolp_rmse``; ``aolp_mae``:
   circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
   at the own pose.
@@ -36,6 +37,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from mmsynth.errors import InputError
+from mmsynth.operations.evaluation.parts import PARTS, parts_of
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
@@ -154,6 +156,10 @@ def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
         sensor = exam.field.sensors[name]
         _checked(light, (*size, _components(sensor)), f"gt/aligned, {name} view {frame.view}")
         _score_truth(exam.scores[name], "psnr_aligned", sensor, rendering, light, where)
+        if "depth_z" in shape:
+            brightness = light[..., :1] if sensor.is_polarization else light
+            for part, pixels in parts_of(brightness, shape, exam.truth.labels(), where).items():
+                _score_truth(exam.scores[name], f"psnr_{part}", sensor, rendering, light, pixels)
         _score_light(exam.scores[name], sensor, rendering, light, where)
     if "depth_z" in shape and exam.metric:  # the truth is in metres
         _score_geometry(exam.geometry, rendering, shape, where)
@@ -304,6 +310,6 @@ def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
         if value is not None:
             out |= {"psnr_foreground": value, "psnr_foreground_view_mean": scores.value(f"view_mean/{source}"), "foreground_from": source}
             break
-    out |= _values(scores, ("ssim", "psnr_truth", "psnr_truth_full", "psnr_aligned"))
+    out |= _values(scores, ("ssim", "psnr_truth", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS)))
     light = ("sam", "stokes_rmse", "dolp_rmse", "aolp_mae")
     return out | (_values(scores, light) or _values(own_pose, light))

@@ -20,6 +20,7 @@ from mmsynth.field.kernels.constants import (
     FACE_OVERSHOOT,
     FEATURES,
     FIRST_FEATURE_ROW,
+    LAYER_GAP,
     LEAST_ADVANCE,
     LEAST_WEIGHT,
     LONGEST_STEP,
@@ -215,16 +216,23 @@ def _march(begin, count, slot, rays, states, sampling, grid, network, store):  #
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_sections(begin, count, slot, rays, contracted, sampling, store, opacity, depth):  # type: ignore[no-untyped-def]
-    """Weights of the sections of a chunk's rays: opacity, depth, and the sections that matter, in the order of the rays: how many."""
+def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight, depth):  # type: ignore[no-untyped-def]
+    """Weights of the sections of a chunk's rays: depth, and the sections that matter, in the order of the rays: how many.
+
+    weight: (2, R) of the nearest surface of each ray and of what is behind it.
+    """
     min_weight = np.float32(sampling.min_section_weight)
     origins, directions = rays.origins, rays.directions
     t_of, f_of, p_of, s_block = store.t_of, store.f_of, store.p_of, store.s_block
     sections = np.int64(0)  # as a literal, blocks would be compiled for it, too
+    gap = np.float32(LAYER_GAP / sampling.sharpness)
     for i in range(count):
         o = begin + i
         tau_sum = 0.0
         before = 0.0
+        nearest = -1.0  # the weight of the nearest surface, once there is a second
+        first = sections
+        store.second[slot, i] = MAX_SAMPLES_PER_RAY
         depth[o] = np.float32(np.nan)
         for k in range(store.counts[slot, i] - 1):
             here = i * MAX_SAMPLES_PER_RAY + k
@@ -251,6 +259,12 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, opacit
                     z = origins[o, 2] + directions[o, 2] * t
                     if contracted:
                         x, y, z, _ = _contract(x, y, z)
+                    if sections > first and nearest < 0.0:
+                        last = 3 * (sections - 1)
+                        dx, dy, dz = x - s_block[slot, last], y - s_block[slot, last + 1], z - s_block[slot, last + 2]
+                        if math.sqrt(dx * dx + dy * dy + dz * dz) > gap:
+                            nearest = before
+                            store.second[slot, i] = k
                     s_block[slot, 3 * sections] = x
                     s_block[slot, 3 * sections + 1] = y
                     s_block[slot, 3 * sections + 2] = z
@@ -260,31 +274,32 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, opacit
                     store.s_weight[slot, sections] = w
                     sections += 1
             before += w
-        opacity[o] = before
+        weight[0, o] = before if nearest < 0.0 else nearest
+        weight[1, o] = 0.0 if nearest < 0.0 else before - nearest
     store.s_count[slot, 0] = sections
     return sections
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _composite(begin, count, slot, sections, appearance, store, features, shown):  # type: ignore[no-untyped-def]
-    """Features of a chunk's rays: the mean over their sections."""
+    """Features of a chunk's rays: the mean over the sections of each surface, (2, R, F)."""
     s_block, width = store.s_block, FEATURES * appearance.active
     _to_rows(s_block[slot], sections)
     encode_block(s_block[slot], sections, appearance, 3)
-    for i in range(count):
-        shown[begin + i] = np.float32(0.0)
-        for j in range(FEATURES * appearance.resolutions.shape[0]):
-            features[begin + i, j] = np.float32(0.0)
+    shown[:, begin : begin + count] = np.float32(0.0)
+    features[:, begin : begin + count] = np.float32(0.0)
     for s in range(sections):
-        o = begin + store.s_ray[slot, s]
+        i = store.s_ray[slot, s]
+        which = 1 if store.s_k[slot, s] >= store.second[slot, i] else 0
         w = store.s_weight[slot, s]
-        shown[o] += w
+        shown[which, begin + i] += w
         for j in range(width):
-            features[o, j] += w * s_block[slot, (3 + j) * sections + s]
+            features[which, begin + i, j] += w * s_block[slot, (3 + j) * sections + s]
     for i in range(count):
-        scale = np.float32(1.0) / max(shown[begin + i], _LEAST_WEIGHT)
-        for j in range(width):
-            features[begin + i, j] *= scale
+        for which in range(2 if store.second[slot, i] < MAX_SAMPLES_PER_RAY else 1):
+            scale = np.float32(1.0) / max(shown[which, begin + i], _LEAST_WEIGHT)
+            for j in range(width):
+                features[which, begin + i, j] *= scale
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -297,5 +312,5 @@ def trace_forward(rays, states, sampling, grid, network, appearance, keep, store
         count = min(CHUNK, total - begin)
         samples[chunk] = _march(begin, count, slot, rays, states, sampling, grid, network, store)
         contracted = grid.extent > np.float32(1.0)
-        sections = _find_sections(begin, count, slot, rays, contracted, sampling, store, out.opacity, out.depth)
+        sections = _find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
         _composite(begin, count, slot, sections, appearance, store, out.features, out.shown)

@@ -26,10 +26,11 @@ P = TypeVar("P", bound=tuple[Any, ...])
 
 
 class TraceOutputs(NamedTuple):
-    """Of rays: as in ``Hits``, but ``samples`` of each chunk; shown: the weight by which features were divided."""
+    """Of rays, (2, R, ...) for the nearest surface of each and what is behind it: features and weight as in ``Hits``, shown: the weight by
+    which features were divided. Of rays: depth. Of chunks: samples."""
 
     features: np.ndarray
-    opacity: np.ndarray
+    weight: np.ndarray
     shown: np.ndarray
     depth: np.ndarray
     samples: np.ndarray
@@ -111,40 +112,49 @@ def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, state
     """See ``reference.trace``; float32. Differentiable in origins, directions, weights, and, in place, the tables."""
     keep = _kept(rays.origins, rays.directions, network.hidden)
     parameters = grid, network, appearance, states, rays, _in_double(sampling)
-    return Hits(*_Trace.apply(keep, rays.origins, rays.directions, network.hidden, network.output, parameters))
+    features, weight, behind, depth, samples = _Trace.apply(keep, rays.origins, rays.directions, network.hidden, network.output, parameters)
+    count = len(depth)
+    opacity = weight[:count]
+    if len(weight) > count:
+        opacity = opacity.index_add(0, torch.nonzero(behind >= 0)[:, 0], weight[count:])
+    return Hits(features, weight, behind, opacity, depth, samples)
 
 
 class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, keep: bool, origins: Tensor, directions: Tensor, hidden: Tensor, output: Tensor, parameters: tuple[Any, ...]
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         grid, network, appearance, states, rays, sampling = parameters
         count, levels = len(origins), len(appearance.resolutions)
         chunks = -(-count // CHUNK)
         units, width = hidden.shape
         store = ray_store(chunks if keep else get_num_threads(), units, width, levels)
-        features = torch.empty(count, FEATURES * levels)
-        opacity, shown, depth = torch.empty(count), torch.empty(count), torch.empty(count)
+        features = torch.empty(2, count, FEATURES * levels)
+        weight, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
         marching.trace_forward(
             _arrays(rays), _array(states), sampling, _arrays(grid), _arrays(network), _arrays(appearance), keep, store.arrays,
-            TraceOutputs(*(x.numpy() for x in (features, opacity, shown, depth, samples))),
+            TraceOutputs(*(x.numpy() for x in (features, weight, shown, depth, samples))),
         )  # fmt: skip
+        behind = torch.full((count,), -1)
+        met_twice = torch.nonzero(weight[1])[:, 0]
+        behind[met_twice] = torch.arange(count, count + len(met_twice))
+        features, weight, shown = (torch.cat([x[0], x[1, met_twice]]) for x in (features, weight, shown))
         if keep:
             ctx.store, ctx.parameters = store, (grid, network, appearance, sampling.sharpness)
-            ctx.save_for_backward(hidden, output, origins, directions, features, shown)
-        ctx.mark_non_differentiable(depth, samples)
-        return features, opacity, depth, samples.sum()
+            ctx.save_for_backward(hidden, output, origins, directions, features, shown, behind)
+        ctx.mark_non_differentiable(behind, depth, samples)
+        return features, weight, behind, depth, samples.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, g_features: Tensor, g_opacity: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        hidden, output, origins, directions, features, shown = ctx.saved_tensors
-        (grid, network, appearance, sharpness), arrays, count = ctx.parameters, ctx.store.arrays, len(features)
+    def backward(ctx: Any, g_features: Tensor, g_weight: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, output, origins, directions, features, shown, behind = ctx.saved_tensors
+        (grid, network, appearance, sharpness), arrays, count = ctx.parameters, ctx.store.arrays, len(origins)
         table, look, weights = _arrays(grid), _arrays(appearance), _arrays(network._replace(hidden=hidden, output=output))
         tracing_gradients.trace_backward(
-            count, *map(_array, (g_features, g_opacity, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
+            *map(_array, (behind, g_features, g_weight, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
         )
         to_rays: list[Tensor | None] = [None, None]
         if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
@@ -161,10 +171,11 @@ class _Trace(torch.autograd.Function):
 
 
 def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """See ``reference.compare``; float32, ``measured.ray`` never decreasing. Differentiable in features, opacity, gain and weights."""
+    """See ``reference.compare``; float32, ``measured.ray`` never decreasing. Differentiable in features, shares, gain and
+    weights of the shader."""
     gain = rays.features.new_empty(0) if gain is None else gain
-    learn = _kept(rays.features, rays.opacity, gain, *weights)
-    return _Compare.apply(learn, rays, measured, rays.features, rays.opacity, gain, *weights)
+    learn = _kept(rays.features, rays.share, gain, *weights)
+    return _Compare.apply(learn, rays, measured, rays.features, rays.share, gain, *weights)
 
 
 class _Compare(torch.autograd.Function):
@@ -172,13 +183,13 @@ class _Compare(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, learn: bool, rays: ShadedRays, measured: Measured, features: Tensor, opacity: Tensor, gain: Tensor, *weights: Tensor
+        ctx: Any, learn: bool, rays: ShadedRays, measured: Measured, features: Tensor, share: Tensor, gain: Tensor, *weights: Tensor
     ) -> tuple[Tensor, Tensor]:
-        chunks = -(-len(features) // shading.CHUNK)
+        chunks = -(-len(rays.behind) // shading.CHUNK)
         tensors = ShaderWeights(*weights)
         arrays = (store := shading_store(max(chunks, get_num_threads()), tensors)).arrays
         loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
-        gradients = [torch.empty(x.shape) for x in (features, opacity, gain)]
+        gradients = [torch.empty(x.shape) for x in (features, share, gain)]
         shading.compare(
             _arrays(rays), _arrays(measured), _array(gain), _arrays(tensors), learn, arrays, loss, squared.numpy(),
             *(g.numpy() for g in gradients),

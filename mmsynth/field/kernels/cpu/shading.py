@@ -1,8 +1,8 @@
 """Shading on the CPU, fused: from the features of rays to the loss of what was measured along them, and all its gradients, in one pass.
 
-Work is cut into chunks of ``CHUNK`` rays, which pass the layers of the shader as matrices with a row per ray. A ray needs few of the
-shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights are summed per
-chunk and the chunks in order, whatever the number of threads.
+Work is cut into chunks of ``CHUNK`` rays; what they meet passes the layers of the shader as matrices with a row per surface. A ray
+needs few of the shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights
+are summed per chunk and the chunks in order, whatever the number of threads.
 
 Matrices have whole tiles: they are padded with zeros, rows to a multiple of ``TILE_ROWS``, columns to one of ``TILE_COLS``.
 """
@@ -178,36 +178,59 @@ def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
 def _measurements(  # type: ignore[no-untyped-def]
-    begin, span, hidden, rays, measured, gain, heads, heads_bias, learn, squared, g_hidden, g_opacity, g_gain, heads_out, heads_bias_out
+    begin,
+    span,
+    first,
+    hidden,
+    rays,
+    measured,
+    gain,
+    heads,
+    heads_bias,
+    learn,
+    squared,
+    g_hidden,
+    g_share,
+    g_gain,
+    heads_out,
+    heads_bias_out,
 ):
     """What was measured along the rays of a chunk, of which ``begin`` is the first: the loss. Gradients are added to.
 
-    span: of the measurements, the first and where they end. hidden: (n, H), a row per ray.
+    span: of the measurements, the first and where they end. hidden: (n, H), a row per surface; what is behind a ray is at its row less
+    ``first``.
     """
-    opacity, trains_geometry = rays.opacity, rays.trains_geometry
+    share, behind, trains_geometry = rays.share, rays.behind, rays.trains_geometry
     target, ray, output, axes, level = measured.target, measured.ray, measured.output, measured.axes, measured.level
-    raw, slope = np.empty(6, np.float32), np.empty(6, np.float32)
+    raw, slope = np.empty(6, np.float32), np.empty((2, 6), np.float32)
+    lights, places, rows = np.empty(2, np.float32), np.empty(2, np.int64), np.empty(2, np.int64)
     bright = len(ray) - len(axes)
     units = heads.shape[1]
     loss = 0.0
     for m in range(span[0], span[1]):
-        o, first = ray[m], output[m]
-        h, g = hidden[o - begin], g_hidden[o - begin]
+        o, column = ray[m], output[m]
+        places[0], rows[0] = o - begin, o
+        places[1], rows[1] = behind[o] - first, behind[o]
+        surfaces = 2 if behind[o] >= 0 else 1
         outputs = 1 if m < bright else 6
-        for j in range(outputs):
-            w = heads[first + j]
-            total = np.float32(0.0)
-            for k in range(units):
-                total += w[k] * h[k]
-            raw[j] = total + heads_bias[first + j]
-        if m < bright:
-            light, slope[0] = _softplus(raw[0])
-        else:
-            light = _intensity(raw, axes[m - bright], slope)
+        seen = np.float32(0.0)
+        for a in range(surfaces):
+            h = hidden[places[a]]
+            for j in range(outputs):
+                w = heads[column + j]
+                total = np.float32(0.0)
+                for k in range(units):
+                    total += w[k] * h[k]
+                raw[j] = total + heads_bias[column + j]
+            if m < bright:
+                lights[a], slope[a, 0] = _softplus(raw[0])
+            else:
+                lights[a] = _intensity(raw, axes[m - bright], slope[a])
+            seen += lights[a] * share[rows[a]]
         brightness = level[m]  # of what is fully seen
         if len(gain):
             brightness *= gain[m]
-        difference = light * brightness * opacity[o] - target[m]
+        difference = seen * brightness - target[m]
         # a clipped pixel only says "at least"
         if target[m] >= measured.saturation[m] and difference > np.float32(0.0):
             difference = np.float32(0.0)
@@ -220,18 +243,20 @@ def _measurements(  # type: ignore[no-untyped-def]
             continue
         pull = measured.weight[m] / level[m] * min(max(relative, -_HUBER), _HUBER)
         if len(gain):
-            g_gain[m] = pull * light * level[m] * opacity[o]
-        if trains_geometry[o]:
-            g_opacity[o] += pull * light * brightness
-        for j in range(outputs):
-            w, w_out = heads[first + j], heads_out[first + j]
-            p = pull * brightness * opacity[o] * slope[j]
-            heads_bias_out[first + j] += p
-            for k in range(units):
-                w_out[k] += p * h[k]
+            g_gain[m] = pull * seen * level[m]
+        for a in range(surfaces):
+            h, g = hidden[places[a]], g_hidden[places[a]]
             if trains_geometry[o]:
+                g_share[rows[a]] += pull * lights[a] * brightness
+            for j in range(outputs):
+                w, w_out = heads[column + j], heads_out[column + j]
+                p = pull * brightness * share[rows[a]] * slope[a, j]
+                heads_bias_out[column + j] += p
                 for k in range(units):
-                    g[k] += p * w[k]
+                    w_out[k] += p * h[k]
+                if trains_geometry[o]:
+                    for k in range(units):
+                        g[k] += p * w[k]
     return loss
 
 
@@ -261,35 +286,42 @@ class Layers(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _chunk(  # type: ignore[no-untyped-def]
-    begin, n, slot, chunk, rays, measured, gain, layers, heads, heads_bias, learn, store, squared, g_features, g_opacity, g_gain
+    begin, count, slot, chunk, rays, measured, gain, layers, heads, heads_bias, learn, store, squared, g_features, g_share, g_gain
 ):
-    """The loss of n rays, and its gradients where ``learn``."""
+    """The loss of some rays, and its gradients where ``learn``. What is behind these rays are rows that follow each other."""
     x, h1, h2, g1, g2 = store.x[slot], store.h1[slot], store.h2[slot], store.g1[slot], store.g2[slot]
     first_out, first_bias_out, second_out = store.first_out[chunk], store.first_bias_out[chunk], store.second_out[chunk]
     second_bias_out, heads_out, heads_bias_out = store.second_bias_out[chunk], store.heads_out[chunk], store.heads_bias_out[chunk]
-    features, directions, degrees = rays.features, rays.directions, rays.degrees
+    features, directions, degrees, behind = rays.features, rays.directions, rays.degrees, rays.behind
     width = features.shape[1]
-    degree = np.int64(0)
-    for i in range(n):
+    degree, n, first = np.int64(0), np.int64(count), np.int64(0)
+    ray_of, row_of = np.empty(2 * CHUNK, np.int64), np.empty(2 * CHUNK, np.int64)
+    for i in range(count):
         degree = max(degree, degrees[begin + i])  # terms of a higher one than any here are zero
+        ray_of[i], row_of[i] = begin + i, begin + i
+        if behind[begin + i] >= 0:
+            if n == count:
+                first = behind[begin + i] - n
+            ray_of[n], row_of[n] = begin + i, behind[begin + i]
+            n += 1
     rows, inputs, used = _whole(n, TILE_ROWS), _whole(width + (HARMONICS if degree else 1), TILE_COLS), _whole(width, TILE_COLS)
     units = h1.shape[1]
     _clear(x, rows, inputs)
     _clear(g2, rows, units)
     for i in range(n):
-        o = begin + i
+        o, row = ray_of[i], row_of[i]
         for j in range(width):
-            x[i, j] = features[o, j]
+            x[i, j] = features[row, j]
         _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degrees[o], x[i, width:])
-        g_opacity[o] = np.float32(0.0)
+        g_share[row] = np.float32(0.0)
     _layer(n, x, inputs, layers.first_turned, layers.first_bias, h1)
     _layer(n, h1, units, layers.second_turned, layers.second_bias, h2)
     if learn:
         first_out[:], second_out[:], heads_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         first_bias_out[:], second_bias_out[:], heads_bias_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    span = _first_at(measured.ray, begin), _first_at(measured.ray, begin + n)
+    span = _first_at(measured.ray, begin), _first_at(measured.ray, begin + count)
     loss = _measurements(
-        begin, span, h2, rays, measured, gain, heads, heads_bias, learn, squared, g2, g_opacity, g_gain, heads_out, heads_bias_out
+        begin, span, first, h2, rays, measured, gain, heads, heads_bias, learn, squared, g2, g_share, g_gain, heads_out, heads_bias_out
     )
     if learn:
         _layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
@@ -300,17 +332,17 @@ def _chunk(  # type: ignore[no-untyped-def]
         _add_product(g1, layers.first, x, rows, units, used)
         for i in range(n):
             for j in range(width):
-                g_features[begin + i, j] = x[i, j]
+                g_features[row_of[i], j] = x[i, j]
     return loss
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def compare(rays, measured, gain, weights, learn, store, loss, squared, g_features, g_opacity, g_gain):  # type: ignore[no-untyped-def]
+def compare(rays, measured, gain, weights, learn, store, loss, squared, g_features, g_share, g_gain):  # type: ignore[no-untyped-def]
     """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` may be empty; the loss and gradients of weights are per chunk.
 
     store: ``ShadingStore``, whose scratch has a slot per thread.
     """
-    total = len(rays.features)
+    total = len(rays.behind)
     layers = Layers(
         _padded(weights.first), _padded(weights.first.T), weights.first_bias,
         _padded(weights.second), _padded(weights.second.T), weights.second_bias,
@@ -320,7 +352,7 @@ def compare(rays, measured, gain, weights, learn, store, loss, squared, g_featur
         begin = chunk * CHUNK
         loss[chunk] = _chunk(
             begin, min(CHUNK, total - begin), slot, chunk, rays, measured, gain, layers, weights.heads, weights.heads_bias,
-            learn, store, squared, g_features, g_opacity, g_gain,
+            learn, store, squared, g_features, g_share, g_gain,
         )  # fmt: skip
 
 

@@ -31,8 +31,9 @@ class SurfaceStore(NamedTuple):
 class RayStore(NamedTuple):
     """Of rays. Per sample, in the order of the blocks: block, hidden, sdf, ray_of, time_of. Per ray and number of the sample
     (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), id_of (place in the order of the blocks); counts: samples
-    of each ray; rounds, sizes: number and lengths of the blocks. Sections that matter: s_block (position and features), s_ray,
-    s_k (its first sample), s_time, s_weight, s_count. row: scratch; the weights' gradients."""
+    of each ray; second: the sample at which its second surface begins; rounds, sizes: number and lengths of the blocks. Sections that
+    matter: s_block (position and features), s_ray, s_k (its first sample), s_time, s_weight, s_count. row: scratch; the
+    weights' gradients."""
 
     block: np.ndarray
     hidden: np.ndarray
@@ -44,6 +45,7 @@ class RayStore(NamedTuple):
     p_of: np.ndarray
     id_of: np.ndarray
     counts: np.ndarray
+    second: np.ndarray
     rounds: np.ndarray
     sizes: np.ndarray
     s_block: np.ndarray
@@ -109,7 +111,7 @@ def ray_store(slots: int, units: int, width: int, appearance_levels: int) -> Sto
     lengths: dict[str, tuple[type, int]] = {
         "block": (f, width * most), "hidden": (f, units * most), "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most),
         "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "id_of": (i, most),
-        "counts": (i, CHUNK), "rounds": (i, 1), "sizes": (i, most),
+        "counts": (i, CHUNK), "second": (i, CHUNK), "rounds": (i, 1), "sizes": (i, most),
         "s_block": (f, (3 + FEATURES * appearance_levels) * most), "s_ray": (i, most), "s_k": (i, most), "s_time": (f, most),
         "s_weight": (f, most), "s_count": (i, 1),
     }  # fmt: skip
@@ -123,9 +125,10 @@ def _network(units: int, width: int) -> Sizes:
 def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
     """Matrices have whole tiles."""
     rows, columns = (-(-n // shading.TILE_COLS) * shading.TILE_COLS for n in weights.first.shape)
-    block, heads = (shading.CHUNK, rows), weights.heads.shape
+    most = 2 * shading.CHUNK  # surfaces, of which a ray meets two at the most
+    block, heads = (most, rows), weights.heads.shape
     shapes = {
-        "x": (shading.CHUNK, columns), "h1": block, "h2": block, "g1": block, "g2": block,
+        "x": (most, columns), "h1": block, "h2": block, "g1": block, "g2": block,
         "first_out": (rows, columns), "first_bias_out": (rows,), "second_out": (rows, rows), "second_bias_out": (rows,),
         "heads_out": tuple(heads), "heads_bias_out": (heads[0],),
     }  # fmt: skip

@@ -15,8 +15,14 @@ _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def trace_backward(rays, g_features, g_opacity, features, shown, sharpness, active, network, a_active, store):  # type: ignore[no-untyped-def]
-    """Gradients of what ``trace_forward`` stored: weights per chunk; distances and feature rows are replaced by their gradients."""
+def trace_backward(  # type: ignore[no-untyped-def]
+    behind, g_features, g_weight, features, shown, sharpness, active, network, a_active, store
+):
+    """Gradients of what ``trace_forward`` stored: weights per chunk; distances and feature rows are replaced by their gradients.
+
+    behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
+    """
+    rays = behind.shape[0]
     size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
     units = network.hidden.shape[0]
     sdf, p_of, id_of = store.sdf, store.p_of, store.id_of
@@ -29,30 +35,31 @@ def trace_backward(rays, g_features, g_opacity, features, shown, sharpness, acti
         sections = store.s_count[chunk, 0]
         sf = store.s_block[chunk]
         at = 0
-        g_weight = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
+        g_section = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
         for i in range(count):
             o = begin + i
-            samples = store.counts[chunk, i]
+            samples, second = store.counts[chunk, i], store.second[chunk, i]
             for k in range(samples):
                 sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] = np.float32(0.0)
-                g_weight[k] = g_opacity[o]
-            scale = np.float32(1.0) / max(shown[o], _LEAST_WEIGHT)
+                g_section[k] = g_weight[o if k < second else behind[o]]
             while at < sections and store.s_ray[chunk, at] == i:
-                g = g_opacity[o]
+                row = o if store.s_k[chunk, at] < second else behind[o]
+                scale = np.float32(1.0) / max(shown[row], _LEAST_WEIGHT)
+                g = g_weight[row]
                 w = store.s_weight[chunk, at] * scale
                 for j in range(FEATURES * a_active):
                     place = (3 + j) * sections + at
-                    gf = g_features[o, j]
-                    g += gf * scale * (sf[place] - features[o, j])
+                    gf = g_features[row, j]
+                    g += gf * scale * (sf[place] - features[row, j])
                     sf[place] = gf * w
-                g_weight[store.s_k[chunk, at]] = g
+                g_section[store.s_k[chunk, at]] = g
                 at += 1
             # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
             tau_sum = 0.0
             total = 0.0
             for k in range(samples - 1):
                 tau = max(0.0, p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1] - p_of[chunk, i * MAX_SAMPLES_PER_RAY + k])
-                total += g_weight[k] * math.exp(-tau_sum) * -math.expm1(-tau)
+                total += g_section[k] * math.exp(-tau_sum) * -math.expm1(-tau)
                 tau_sum += tau
             tau_sum = 0.0
             for k in range(samples - 1):
@@ -60,9 +67,9 @@ def trace_backward(rays, g_features, g_opacity, features, shown, sharpness, acti
                 tau = p1 - p0
                 if tau > 1e-7:
                     transmittance = math.exp(-tau_sum)
-                    total -= g_weight[k] * transmittance * -math.expm1(-tau)
+                    total -= g_section[k] * transmittance * -math.expm1(-tau)
                     # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
-                    d_tau = g_weight[k] * transmittance * math.exp(-tau) - total
+                    d_tau = g_section[k] * transmittance * math.exp(-tau) - total
                     sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] += np.float32(d_tau * sharpness * -math.expm1(-p0))
                     sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]] -= np.float32(d_tau * sharpness * -math.expm1(-p1))
                     tau_sum += tau
