@@ -15,14 +15,16 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
+from mmsynth.field.light import Light, stokes
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
-from mmsynth.sensors.polarization import reference_axes
+from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 
 TILE = 8192  # rays at a time: what they need stays in the caches
+_NORMAL_CELLS = 2.0  # over which normals are differences: fewer have the grid's noise in them
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
 
@@ -73,6 +75,7 @@ class Design:
     radiance_finest: int = 256
     background: bool = False
     far_light: bool = False
+    light: bool = False
     outer_radius: float = 1.9
     surface_hidden: int = 32
     radiance_hidden: int = 64
@@ -92,6 +95,7 @@ class Field(nn.Module):
         rig: sensor → (4, 4) sensor_to_reference, scene unit; the reference is the first sensor.
         sampling: how finely it is rendered. manifest: everything known about the fit.
         view_dependence: degree of the spherical harmonics of each modality's radiance.
+        light: lamps, and what surfaces mirror of them; None where nothing shines.
         far_light: (F,) features of the light that passes the region, None where that is black or the background is modelled.
         corrections: of the poses of the scene's frames (see ``pose_of``); the rig has them already.
     """
@@ -120,6 +124,7 @@ class Field(nn.Module):
         )
         self.appearance = HashGrid(d.radiance_levels, d.radiance_rows_log2, d.coarsest, d.radiance_finest, extent)
         self.shader = Shader(self.appearance.width, d.radiance_hidden, sensors, radiance_scale)
+        self.light = Light(self.appearance.width, self.shader.heads.out_features) if d.light else None
         self.far_light = nn.Parameter(torch.zeros(self.appearance.width)) if d.far_light else None
         self.occupancy = Occupancy(d.occupancy, extent)
         self.sampling = Sampling(20.0, 0.05, d.surface_levels, d.radiance_levels)
@@ -168,6 +173,16 @@ class Field(nn.Module):
         mixed = (passed / share.clamp(min=LEAST_WEIGHT))[:, None]
         return hits._replace(features=torch.lerp(hits.features, self.far_light.expand_as(hits.features), mixed), share=share)
 
+    def slopes(self, points: Tensor, active: int) -> Tensor:
+        """∇sdf (N, 3) in the frame of the grid, at points (N, 3) of the normalised frame."""
+        return self.surface.gradient(self.surface.grid.to_grid(points), _NORMAL_CELLS * self.surface.grid.cell(active), active)
+
+    def normals(self, points: Tensor, slopes: Tensor) -> Tensor:
+        """Unit, outward (N, 3), in the normalised frame, from ``slopes`` at these points."""
+        if self.surface.grid.extent > 1.0:
+            slopes = kernels.contracted_velocity(points, slopes)  # the chain rule: the contraction's Jacobian is symmetric
+        return torch.nn.functional.normalize(slopes, dim=-1)
+
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
         """Signed distance in the scene's unit, positive outside: (N, 3) → (N,) float32. Of contracted space, where it is."""
@@ -192,14 +207,17 @@ class Field(nn.Module):
         self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
-        shaded = self.with_far_light(hits)
-        ray = kernels.rays_of(shaded.behind)
+        shaded, rays = self.with_far_light(hits), len(directions)
+        ray = kernels.rays_of(hits.behind)
+        lamps = self.light.lamps() if self.light is not None and self.shines and modalities else None
+        mirrors = None if lamps is None else self.mirrors(hits, origins, directions, self.sampling.active_surface)[0]
+        images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
         outputs = {d: self.shader(shaded.features, directions[ray], d) for d in {self.view_dependence[n] for n in modalities}}
 
-        def together(light: Tensor) -> Tensor:
+        def together(light: Tensor, share: Tensor) -> Tensor:
             """Of the surfaces that a ray meets, (H, C) → (R, C)."""
-            seen = shaded.share[:, None] * light
-            return seen[: len(directions)].index_add(0, ray[len(directions) :], seen[len(directions) :])
+            seen = share[:, None] * light
+            return seen[:rays].index_add(0, ray[rays:], seen[rays:])
 
         # a background is opaque, too, but what lies there is not the object
         reached = torch.linalg.vector_norm(origins + directions * hits.depth[:, None], dim=-1)
@@ -207,26 +225,60 @@ class Field(nn.Module):
         seen = torch.where(within, hits.opacity, torch.zeros_like(hits.opacity)).clamp(0.0, 1.0)
         out = {"opacity": seen, "depth": hits.depth}
         for name in modalities:
+            raw, scale = outputs[self.view_dependence[name]], self.radiance_scale[name]
             angles = self.sensors[name].polarizer_angles_deg
             if angles is None:
-                out[name] = together(self.shader.values(name, outputs[self.view_dependence[name]]))
+                out[name] = together(self.shader.values(name, raw), shaded.share)
+                if lamps is not None and images is not None:
+                    out[name] += scale * together(images.amount @ lamps.spectrum[:, self.shader.columns[name]], hits.share)
                 continue
             x, y = (axis[ray] for axis in reference_axes(directions, camera_x))
-            turned = torch.deg2rad(torch.tensor(angles, device=origins.device))
-            light = self.shader.polarized(name, outputs[self.view_dependence[name]], x, y, turned)
-            out[name], out[f"stokes/{name}"] = map(together, light)
+            behind, vectors = self.shader.polarized(name, raw, x, y, torch.deg2rad(torch.tensor(angles, device=origins.device)))
+            out[name], out[f"stokes/{name}"] = together(behind, shaded.share), together(vectors, shaded.share)
+            if lamps is not None and images is not None:
+                more = scale * together(stokes(images, lamps.spectrum[:, self.shader.columns[name].start], x, y), hits.share)
+                out[f"stokes/{name}"] += more
+                out[name] += stokes_to_intensities(more, angles)
         if geometry:
-            depth = hits.depth
-            hit = torch.nonzero(torch.isfinite(depth))[:, 0]
+            # of the surface at which half of the light is met
+            nearest = torch.where((hits.share[:rays] >= 0.5) | (hits.behind < 0), ray[:rays], hits.behind)
+            hit = torch.nonzero(torch.isfinite(hits.depth))[:, 0]
             normal = torch.full_like(directions, float("nan"))
-            epsilon = self.surface.grid.cell(self.sampling.active_surface)
-            points = origins[hit] + directions[hit] * depth[hit, None]
-            slope = self.surface.gradient(self.surface.grid.to_grid(points), epsilon, self.sampling.active_surface)
-            if self.surface.grid.extent > 1.0:
-                slope = kernels.contracted_velocity(points, slope)  # the chain rule: the contraction's Jacobian is symmetric
-            normal[hit] = torch.nn.functional.normalize(slope, dim=-1)
+            if mirrors is None:
+                points = origins[hit] + directions[hit] * hits.depth[hit, None]
+                normal[hit] = self.normals(points, self.slopes(points, self.sampling.active_surface))
+            else:
+                normal[hit] = mirrors.normals[nearest[hit]]
             out["normal"] = normal
         return out
+
+    @property
+    def shines(self) -> bool:
+        """Whether there are lamps whose light surfaces mirror."""
+        return self.light is not None and int(self.light.count) > 0
+
+    def mirrors(self, hits: rendering.Hits, origins: Tensor, directions: Tensor, active: int) -> tuple[kernels.Mirrors, Tensor]:
+        """The surfaces that rays met as mirrors of the field's lamps, and ∇sdf there in the frame of the grid, (H, 3).
+
+        Args:
+            active: levels of the surface's grid.
+        Raises:
+            ValueError: the field has no light.
+        """
+        if self.light is None:
+            raise ValueError("a field without light")
+        ray = kernels.rays_of(hits.behind)
+        points = origins[ray] + directions[ray] * hits.distance[:, None]
+        slopes = self.slopes(points.detach(), active)
+        normals = self.normals(points.detach(), slopes)
+        return kernels.Mirrors(self.light.material(hits.features), normals, points, directions[ray], hits.share), slopes
+
+    def mirrored(self, hits: rendering.Hits, origins: Tensor, directions: Tensor, measured: kernels.Measured, active: int) -> Tensor:
+        """Mirrored light in each number that was measured along rays, (M,), 0 where nothing shines."""
+        if self.light is None or not self.shines:
+            return torch.zeros_like(measured.level)
+        mirrors, _ = self.mirrors(hits, origins, directions, active)
+        return kernels.mirror(self.light.lamps(), mirrors, hits.behind, measured) * measured.level
 
     def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
         """``render_rays`` of rays of one camera: directions (R, 3) in its axes, scene frame; depth stays in radii."""

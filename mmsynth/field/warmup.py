@@ -43,7 +43,11 @@ def run_kernels() -> None:
         weights = Shader(4, 4, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}).weights()
         one, index = torch.ones(1), torch.zeros(1, dtype=torch.int64)
         rays = kernels.ShadedRays(hits.features, hits.share, hits.behind, directions, index, index == 0)
-        loss, _ = kernels.compare(weights, rays, kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one))
+        measured = kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one)
+        loss, _ = kernels.compare(weights, rays, measured)
+        lamps, share = kernels.Lamps(torch.ones(1, 3, requires_grad=True), torch.ones(1, 1)), hits.share.detach()
+        mirrors = kernels.Mirrors(torch.zeros(1, 3), directions, directions, directions, share)
+        loss = loss + kernels.mirror(lamps, mirrors, hits.behind, measured).sum()
         (loss + surface(origins.detach(), 1).sum()).backward()
     with torch.no_grad():
         kernels.shade(weights, hits.features, directions, 0)

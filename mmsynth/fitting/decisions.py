@@ -49,9 +49,10 @@ def decide(field: Field, measurements: dict[str, Measurements], recipe: Radiance
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
     ray = kernels.rays_of(hits.behind)
     outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
-    predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind)
+    mirrored = field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface)
+    predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind) + mirrored
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, hits, batch)
+        errors = errors_by_degree(field.shader, hits, batch, mirrored)
         degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in batch.parts}
     else:
         asked = recipe.view_dependence
@@ -79,7 +80,7 @@ def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measureme
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
-def errors_by_degree(shader: Shader, hits: kernels.Hits, batch: Batch) -> dict[str, list[float]]:
+def errors_by_degree(shader: Shader, hits: kernels.Hits, batch: Batch, mirrored: Tensor) -> dict[str, list[float]]:
     """Mean squared error of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
 
     Copies of the shader, one per degree, go on learning for some steps from the rays of even number, geometry and appearance
@@ -87,7 +88,7 @@ def errors_by_degree(shader: Shader, hits: kernels.Hits, batch: Batch) -> dict[s
     taken from it would not tell: it uses what it is given, needed or not.)
 
     Args:
-        hits: of the R rays. batch: these rays, and what was measured along them.
+        hits: of the R rays. batch: these rays, and what was measured along them. mirrored: (M,) light that is not the shader's.
     Returns:
         by modality; NaN where every number is clipped.
     """
@@ -100,7 +101,9 @@ def errors_by_degree(shader: Shader, hits: kernels.Hits, batch: Batch) -> dict[s
         optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
         for step in range(_STEPS + 1):
             with torch.enable_grad():
-                predicted = kernels.predict(candidate(hits.features, directions, degree), hits.share, batch.measured, hits.behind)
+                predicted = (
+                    kernels.predict(candidate(hits.features, directions, degree), hits.share, batch.measured, hits.behind) + mirrored
+                )
                 difference = kernels.residual(predicted, batch.measured)
                 if step < _STEPS:
                     kernels.photometric(difference * learned, batch.measured).backward()

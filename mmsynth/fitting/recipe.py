@@ -65,6 +65,10 @@ class RadianceRecipe(_Section):
     view_dependence_min_improvement: float = _key(
         0.05, "Share of the error that a higher degree must save [1], where the degree is auto.", ge=0
     )
+    light: Switch = _key("auto", "Lamps that surfaces mirror: highlights, and their polarization, by place, normal and roughness.")
+    light_min_improvement: float = _key(
+        0.03, "Share of the error of rays not learned from that lamps must save [1], where light is auto.", ge=0
+    )
     exposure: Switch = _key("auto", "An exposure factor of every frame.")
     exposure_min_spread: float = _key(
         0.05, "Relative spread of exposure between frames that asks for these factors [1], where exposure is auto.", gt=0
@@ -110,6 +114,8 @@ class ScheduleRecipe(_Section):
         lt=1,
     )
     view_dependence_from: float = _key(0.3, "Progress before which radiance has no direction [progress].", ge=0, le=1)
+    light_at: float = _key(0.3, "Progress at which lamps are looked for, and from which surfaces mirror them [progress].", ge=0, le=1)
+    light_until: float = _key(0.45, "Progress at which residuals decide whether that is needed [progress].", ge=0, le=1)
     decide_at: float = _key(0.6, "Progress at which residuals decide on view dependence and exposure [progress].", ge=0, le=1)
     learning_rate_grid: float = _key(2e-2, "Adam's rate of the hash tables [1/step].", gt=0)
     learning_rate_network: float = _key(8e-3, "Adam's rate of the networks [1/step].", gt=0)

@@ -56,10 +56,10 @@ def ray_residuals(
     try:
         with torch.enable_grad():
             hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
-            hits = field.with_far_light(hits) if far_light else hits
-            ray = kernels.rays_of(hits.behind)
-            outputs = field.shader(hits.features, directions[ray], degrees[ray])
-            predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind)
+            shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind)
+            outputs = field.shader(shaded.features, directions[ray], degrees[ray])
+            predicted = kernels.predict(outputs, shaded.share, batch.measured, hits.behind)
+            predicted = predicted + field.mirrored(hits, origins, directions, batch.measured, sampling.active_surface)
             relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.measured.level
             mean = torch.zeros_like(middle).index_add(0, batch.measured.ray, relative) / torch.bincount(
                 batch.measured.ray, minlength=len(origins)

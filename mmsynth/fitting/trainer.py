@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import losses
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
+from mmsynth.fitting.lighting import decide_light, look_for_lamps
 from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, in_order, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
@@ -59,6 +60,8 @@ class _State:
     bad_steps: int = 0
     reopened: int = 0
     tables: TableSizes | None = None
+    lamps_sought: bool = False
+    light: Choice[bool] | None = None
     decided: Decisions | None = None
     mean_loss: float = math.nan
     mean_error: dict[str, float] = field(default_factory=dict)
@@ -121,6 +124,7 @@ class Trainer:
             **self.needs.choices,
             **({} if tables is None else {"tables": tables.choice}),
             **self.refinement.choices,
+            **({} if self.state.light is None else {"light": self.state.light}),
             **({} if decided is None else decided.choices),
         }
 
@@ -164,6 +168,12 @@ class Trainer:
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
             self._resize_tables(state.tables, generator)
+        if not state.lamps_sought and self.progress >= schedule.light_at:
+            look_for_lamps(field, self.measurements, sampling, self.seed)
+            state.lamps_sought = True
+        if state.light is None and (self.progress >= schedule.light_until or (state.lamps_sought and not field.shines)):
+            state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed)
+            self._mirror(state.light)
         if state.decided is None:
             # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
             seen = 0 if self.progress < schedule.view_dependence_from else DEGREES
@@ -226,7 +236,8 @@ class Trainer:
         # light from beyond the region would explain what is in it as long as that has no shape
         shaded = field.with_far_light(hits) if self.state.decided is not None else hits
         rays = kernels.ShadedRays(shaded.features, shaded.share, shaded.behind, batch.directions, degrees, trains_geometry)
-        loss, squared = kernels.compare(field.shader.weights(), rays, batch.measured, gain)
+        light, slopes = self._mirrored(hits, batch, trains_geometry, sampling) if field.shines else (None, None)
+        loss, squared = kernels.compare(field.shader.weights(), rays, batch.measured, gain, light)
         errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)
@@ -236,7 +247,7 @@ class Trainer:
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
             loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
-            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, batch, sampling, generator))
+            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, batch, slopes, sampling, generator))
         return loss, errors, int(hits.samples)
 
     @property
@@ -262,22 +273,43 @@ class Trainer:
             self.optimiser.resize(name, rows)
             self.average.resize(name, rows)
 
+    def _mirror(self, light: Choice[bool]) -> None:
+        if not light.value:
+            self.field.light = None
+            self.field.design = replace(self.field.design, light=False)
+
     def _see_directions(self, decisions: Decisions) -> None:
         self.field.view_dependence.update({name: choice.value for name, choice in decisions.view_dependence.items()})
 
-    def _gradients(self, hits: kernels.Hits, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> torch.Tensor:
-        """∇sdf around some of the hits, within the soft surface, and at some points of the whole region."""
+    def _mirrored(
+        self, hits: kernels.Hits, batch: Batch, trains_geometry: torch.Tensor, sampling: kernels.Sampling
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mirrored light in each number, (M,), and ∇sdf at the surfaces that mirror it."""
+        light = self.field.light
+        assert light is not None
+        mirrors, slopes = self.field.mirrors(hits, batch.origins, batch.directions, sampling.active_surface)
+        if self.needs.sparse:
+            trains = trains_geometry[kernels.rays_of(hits.behind)]
+            kept = lambda x: torch.where(trains if x.dim() == 1 else trains[:, None], x, x.detach())
+            mirrors = mirrors._replace(material=kept(mirrors.material), normals=kept(mirrors.normals), share=kept(mirrors.share))
+        return kernels.mirror(light.lamps(), mirrors, hits.behind, batch.measured), slopes[hits.distance > 0]
+
+    def _gradients(
+        self, hits: kernels.Hits, batch: Batch, slopes: torch.Tensor | None, sampling: kernels.Sampling, generator: torch.Generator
+    ) -> torch.Tensor:
+        """∇sdf at some points of the whole region, and at what was hit: ``slopes`` where they are known, else around some of the hits,
+        within the soft surface."""
         count = self.recipe.loss.eikonal_points
-        extent = self.field.surface.grid.extent
-        points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * extent).to(self.device)]
+        surface = self.field.surface
+        points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * surface.grid.extent).to(self.device)]
         hit = torch.nonzero(torch.isfinite(hits.depth))[:, 0]
-        if len(hit):
+        if slopes is None and len(hit):
             chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
             noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
             at = batch.origins[chosen] + batch.directions[chosen] * hits.depth[chosen, None]
-            points.append(self.field.surface.grid.to_grid(at) + noise)
-        epsilon = self.field.surface.grid.cell(sampling.active_surface)
-        return self.field.surface.gradient(torch.cat(points), epsilon, sampling.active_surface)
+            points.append(surface.grid.to_grid(at) + noise)
+        found = surface.gradient(torch.cat(points), surface.grid.cell(sampling.active_surface), sampling.active_surface)
+        return found if slopes is None else torch.cat([found, slopes])
 
     def _skip(self, reason: str) -> None:
         self.state.step += 1
@@ -320,6 +352,8 @@ class Trainer:
         self.state = TypeAdapter(_State).validate_python(saved["state"])
         if self.state.tables is not None:
             self._resize_tables(self.state.tables, torch.Generator())  # what is new is read from the checkpoint
+        if self.state.light is not None:
+            self._mirror(self.state.light)
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])

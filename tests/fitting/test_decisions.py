@@ -64,8 +64,8 @@ def test_the_degree_that_light_has_is_found(needed: int) -> None:
         ).backward()
         teacher.step()
     before = [p.detach().clone() for p in shader.parameters()]
-    hits = kernels.Hits(torch.zeros(rays, 2), ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
-    errors = errors_by_degree(shader, hits, batch)["grey"]
+    hits = kernels.Hits(torch.zeros(rays, 2), ones, ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
+    errors = errors_by_degree(shader, hits, batch, torch.zeros(rays))["grey"]
     assert len(errors) == DEGREES + 1
     assert degree_needed(errors, worth=0.1) == needed, errors
     assert all(bool((p == q).all()) for p, q in zip(shader.parameters(), before, strict=True))  # copies learned, not the shader

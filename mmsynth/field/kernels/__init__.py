@@ -17,14 +17,27 @@ from torch import Tensor
 
 from mmsynth.field.kernels import cpu, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
-from mmsynth.field.kernels.parameters import GridTable, Hits, Measured, Rays, Samples, Sampling, ShadedRays, ShaderWeights, SurfaceNetwork
+from mmsynth.field.kernels.mirroring import Reflection, reflect
+from mmsynth.field.kernels.parameters import (
+    GridTable,
+    Hits,
+    Lamps,
+    Measured,
+    Mirrors,
+    Rays,
+    Samples,
+    Sampling,
+    ShadedRays,
+    ShaderWeights,
+    SurfaceNetwork,
+)
 from mmsynth.field.kernels.reference import contract, contracted_velocity, intensity, photometric, predict, radiance, rays_of, residual
 
 __all__ = [
-    "OUTSIDE", "SHELL", "SOLID",
-    "GridTable", "Hits", "Measured", "Rays", "Samples", "Sampling", "ShadedRays", "ShaderWeights", "SurfaceNetwork",
-    "adam", "compare", "contract", "contracted_velocity", "hash_encode", "intensity", "march", "photometric", "predict", "radiance",
-    "rays_of", "residual", "section_weights", "shade", "surface_value", "trace",
+    "OUTSIDE", "SHELL", "SOLID", "GridTable", "Hits", "Lamps", "Measured", "Mirrors", "Rays", "Reflection", "Samples", "Sampling",
+    "ShadedRays", "ShaderWeights", "SurfaceNetwork",
+    "adam", "compare", "contract", "contracted_velocity", "hash_encode", "intensity", "march", "mirror", "photometric", "predict",
+    "radiance", "rays_of", "reflect", "residual", "section_weights", "shade", "surface_value", "trace",
 ]  # fmt: skip
 
 
@@ -75,9 +88,16 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     return _backend(features).shade(weights, features, directions, degrees)
 
 
-def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def compare(
+    weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None, mirrored: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """The photometric loss of what was measured along rays, and all squared residuals."""
-    return _backend(rays.features).compare(weights, rays, measured, gain)
+    return _backend(rays.features).compare(weights, rays, measured, gain, mirrored)
+
+
+def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -> Tensor:
+    """Mirrored light in each measured number."""
+    return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
 
 
 def adam(

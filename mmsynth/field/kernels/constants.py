@@ -19,4 +19,6 @@ LAYER_GAP = 7.3  # times 1 / sharpness, in the frame of the grid: sections farth
 
 HARMONICS = 16  # spherical harmonics up to degree 3
 HUBER_DELTA = 0.5  # relative residuals above it count linearly
+LEAST_ROUGHNESS = 0.02  # sharper images than any pixel could tell
+REFRACTIVE_INDEX = 1.5  # of what mirrors lamps: glass, plastics, varnish
 LEAST_WEIGHT = 1e-12  # of a ray's sections, by which its features are divided

@@ -96,7 +96,8 @@ class Hits(NamedTuple):
     A row is one surface on one ray: the nearest of each ray, in the order of the rays, and then those behind them, H in all.
 
     Attributes:
-        features: (H, F), the mean over the surface. share: (H,), of the light of its ray. behind: (R,) int64, the row of what is
+        features: (H, F), the mean over the surface. share: (H,), of the light of its ray. distance: (H,), its mean ray
+            distance, 0 = nothing is met; no gradient. behind: (R,) int64, the row of what is
             behind the nearest surface, -1 = nothing; ascending.
         opacity: (R,) in [0, 1], the sum of the shares. depth: (R,), the ray distance at which half of the light is met, NaN = no hit.
         samples: how many were taken, a number.
@@ -104,6 +105,7 @@ class Hits(NamedTuple):
 
     features: Tensor
     share: Tensor
+    distance: Tensor
     behind: Tensor
     opacity: Tensor
     depth: Tensor
@@ -143,3 +145,26 @@ class Measured(NamedTuple):
     level: Tensor
     saturation: Tensor
     weight: Tensor
+
+
+class Lamps(NamedTuple):
+    """K lamps: position (K, 3), normalised frame; spectrum (K, outputs) of their light in each of the shader's outputs, relative to the
+    modality's typical value; of a polarization in the first of six."""
+
+    position: Tensor
+    spectrum: Tensor
+
+
+class Mirrors(NamedTuple):
+    """H surfaces that rays meet, see ``Hits``.
+
+    Attributes:
+        material: (H, 2 + K) before its functions: roughness, strength, visibility of each lamp. normals, points: (H, 3), normalised frame.
+        directions: (H, 3) of the rays that meet them, unit. share: (H,).
+    """
+
+    material: Tensor
+    normals: Tensor
+    points: Tensor
+    directions: Tensor
+    share: Tensor

@@ -27,6 +27,7 @@ from mmsynth.field.kernels.constants import (
     SOFT_SURFACE,
     SOLID,
 )
+from mmsynth.field.kernels.mirroring import mirror as mirror  # of the reference, too
 from mmsynth.field.kernels.parameters import (
     GridTable,
     Hits,
@@ -274,7 +275,8 @@ def composite(
     chosen = torch.nonzero(weights.detach() > sampling.min_section_weight)[:, 0]
     following = (chosen + 1).clamp(max=max(len(t) - 1, 0))
     at, w = ray[chosen], weights[chosen]
-    crossings = position(at, torch.lerp(t[chosen], t[following], crossing[chosen]))
+    where = torch.lerp(t[chosen], t[following], crossing[chosen])
+    crossings = position(at, where)
     encoded = encode(crossings, appearance, hash_encode)
     second = _second_surface(crossings.detach(), at, chosen, LAYER_GAP / sampling.sharpness, count, len(t))
     behind = torch.full_like(second, -1)
@@ -286,7 +288,9 @@ def composite(
     shown = w.new_zeros(rows).index_add(0, row[chosen], w)
     features = torch.zeros(rows, encoded.shape[1], dtype=w.dtype, device=w.device).index_add(0, row[chosen], w[:, None] * encoded)
     depth = _median_depth(t, weights.detach(), before, crossing, ray, count)
-    return Hits(features / shown.clamp(min=LEAST_WEIGHT)[:, None], share, behind, opacity, depth, torch.tensor(len(t)))
+    shown = shown.clamp(min=LEAST_WEIGHT)
+    distance = w.new_zeros(rows).index_add(0, row[chosen], w * where).detach() / shown.detach()
+    return Hits(features / shown[:, None], share, distance, behind, opacity, depth, torch.tensor(len(t)))
 
 
 def _second_surface(crossings: Tensor, ray: Tensor, section: Tensor, gap: float, rays: int, none: int) -> Tensor:
@@ -343,11 +347,13 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     return linear(hidden_layers(weights, features, directions, degrees), weights.heads, weights.heads_bias)
 
 
-def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def compare(
+    weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None, mirrored: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Shade rays and compare them with what was measured.
 
     Args:
-        gain: (M,) factors of the predictions, none: 1.
+        gain: (M,) factors of the predictions, none: 1. mirrored: (M,) relative light that is not the shader's, none: 0.
     Returns:
         The photometric loss, a scalar, and the squared residual of every measurement, (M,), without a gradient.
     """
@@ -357,6 +363,8 @@ def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: 
     hidden = torch.where(trains[:, None], hidden, hidden.detach())
     share = torch.where(trains, rays.share, rays.share.detach())
     predicted = predict(linear(hidden, weights.heads, weights.heads_bias), share, measured, rays.behind)
+    if mirrored is not None:
+        predicted = predicted + mirrored * measured.level
     difference = residual(predicted if gain is None else predicted * gain, measured)
     return photometric(difference, measured), difference.detach().square()
 

@@ -281,23 +281,26 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _composite(begin, count, slot, sections, appearance, store, features, shown):  # type: ignore[no-untyped-def]
-    """Features of a chunk's rays: the mean over the sections of each surface, (2, R, F)."""
+def _composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
+    """Features and distance of a chunk's rays: the mean over the sections of each surface, (2, R, F) and (2, R)."""
     s_block, width = store.s_block, FEATURES * appearance.active
     _to_rows(s_block[slot], sections)
     encode_block(s_block[slot], sections, appearance, 3)
     shown[:, begin : begin + count] = np.float32(0.0)
     features[:, begin : begin + count] = np.float32(0.0)
+    distance[:, begin : begin + count] = np.float32(0.0)
     for s in range(sections):
         i = store.s_ray[slot, s]
         which = 1 if store.s_k[slot, s] >= store.second[slot, i] else 0
         w = store.s_weight[slot, s]
         shown[which, begin + i] += w
+        distance[which, begin + i] += w * store.s_time[slot, s]
         for j in range(width):
             features[which, begin + i, j] += w * s_block[slot, (3 + j) * sections + s]
     for i in range(count):
         for which in range(2 if store.second[slot, i] < MAX_SAMPLES_PER_RAY else 1):
             scale = np.float32(1.0) / max(shown[which, begin + i], _LEAST_WEIGHT)
+            distance[which, begin + i] *= scale
             for j in range(width):
                 features[which, begin + i, j] *= scale
 
@@ -313,4 +316,4 @@ def trace_forward(rays, states, sampling, grid, network, appearance, keep, store
         samples[chunk] = _march(begin, count, slot, rays, states, sampling, grid, network, store)
         contracted = grid.extent > np.float32(1.0)
         sections = _find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
-        _composite(begin, count, slot, sections, appearance, store, out.features, out.shown)
+        _composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)

@@ -16,21 +16,33 @@ from torch import Tensor
 
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
-from mmsynth.field.kernels.cpu import marching, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import marching, mirroring, shading, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.stores import RayStore, SurfaceStore, ray_store, shading_store, surface_store
 from mmsynth.field.kernels.cpu.surface import POINTS
-from mmsynth.field.kernels.parameters import GridTable, Hits, Measured, Rays, Sampling, ShadedRays, ShaderWeights, SurfaceNetwork
+from mmsynth.field.kernels.parameters import (
+    GridTable,
+    Hits,
+    Lamps,
+    Measured,
+    Mirrors,
+    Rays,
+    Sampling,
+    ShadedRays,
+    ShaderWeights,
+    SurfaceNetwork,
+)
 
 P = TypeVar("P", bound=tuple[Any, ...])
 
 
 class TraceOutputs(NamedTuple):
-    """Of rays, (2, R, ...) for the nearest surface of each and what is behind it: features and weight as in ``Hits``, shown: the weight by
-    which features were divided. Of rays: depth. Of chunks: samples."""
+    """Of rays, (2, R, ...) for the nearest surface of each and what is behind it: features, weight (the share) and distance as in ``Hits``,
+    shown: the weight by which features were divided. Of rays: depth. Of chunks: samples."""
 
     features: np.ndarray
     weight: np.ndarray
+    distance: np.ndarray
     shown: np.ndarray
     depth: np.ndarray
     samples: np.ndarray
@@ -112,12 +124,14 @@ def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, state
     """See ``reference.trace``; float32. Differentiable in origins, directions, weights, and, in place, the tables."""
     keep = _kept(rays.origins, rays.directions, network.hidden)
     parameters = grid, network, appearance, states, rays, _in_double(sampling)
-    features, weight, behind, depth, samples = _Trace.apply(keep, rays.origins, rays.directions, network.hidden, network.output, parameters)
+    features, weight, distance, behind, depth, samples = _Trace.apply(
+        keep, rays.origins, rays.directions, network.hidden, network.output, parameters
+    )
     count = len(depth)
     opacity = weight[:count]
     if len(weight) > count:
         opacity = opacity.index_add(0, torch.nonzero(behind >= 0)[:, 0], weight[count:])
-    return Hits(features, weight, behind, opacity, depth, samples)
+    return Hits(features, weight, distance, behind, opacity, depth, samples)
 
 
 class _Trace(torch.autograd.Function):
@@ -131,21 +145,21 @@ class _Trace(torch.autograd.Function):
         units, width = hidden.shape
         store = ray_store(chunks if keep else get_num_threads(), units, width, levels)
         features = torch.empty(2, count, FEATURES * levels)
-        weight, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(count)
+        weight, distance, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
         marching.trace_forward(
             _arrays(rays), _array(states), sampling, _arrays(grid), _arrays(network), _arrays(appearance), keep, store.arrays,
-            TraceOutputs(*(x.numpy() for x in (features, weight, shown, depth, samples))),
+            TraceOutputs(*(x.numpy() for x in (features, weight, distance, shown, depth, samples))),
         )  # fmt: skip
         behind = torch.full((count,), -1)
         met_twice = torch.nonzero(weight[1])[:, 0]
         behind[met_twice] = torch.arange(count, count + len(met_twice))
-        features, weight, shown = (torch.cat([x[0], x[1, met_twice]]) for x in (features, weight, shown))
+        features, weight, distance, shown = (torch.cat([x[0], x[1, met_twice]]) for x in (features, weight, distance, shown))
         if keep:
             ctx.store, ctx.parameters = store, (grid, network, appearance, sampling.sharpness)
             ctx.save_for_backward(hidden, output, origins, directions, features, shown, behind)
-        ctx.mark_non_differentiable(behind, depth, samples)
-        return features, weight, behind, depth, samples.sum()
+        ctx.mark_non_differentiable(distance, behind, depth, samples)
+        return features, weight, distance, behind, depth, samples.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -170,12 +184,15 @@ class _Trace(torch.autograd.Function):
         return None, *to_rays, *_summed(arrays, -(-count // CHUNK)), None
 
 
-def compare(weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """See ``reference.compare``; float32, ``measured.ray`` never decreasing. Differentiable in features, shares, gain and
+def compare(
+    weights: ShaderWeights, rays: ShadedRays, measured: Measured, gain: Tensor | None = None, mirrored: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """See ``reference.compare``; float32, ``measured.ray`` never decreasing. Differentiable in features, shares, gain, mirrored light and
     weights of the shader."""
-    gain = rays.features.new_empty(0) if gain is None else gain
-    learn = _kept(rays.features, rays.share, gain, *weights)
-    return _Compare.apply(learn, rays, measured, rays.features, rays.share, gain, *weights)
+    none = rays.features.new_empty(0)
+    gain, mirrored = none if gain is None else gain, none if mirrored is None else mirrored
+    learn = _kept(rays.features, rays.share, gain, mirrored, *weights)
+    return _Compare.apply(learn, rays, measured, rays.features, rays.share, gain, mirrored, *weights)
 
 
 class _Compare(torch.autograd.Function):
@@ -183,15 +200,23 @@ class _Compare(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, learn: bool, rays: ShadedRays, measured: Measured, features: Tensor, share: Tensor, gain: Tensor, *weights: Tensor
+        ctx: Any,
+        learn: bool,
+        rays: ShadedRays,
+        measured: Measured,
+        features: Tensor,
+        share: Tensor,
+        gain: Tensor,
+        mirrored: Tensor,
+        *weights: Tensor,
     ) -> tuple[Tensor, Tensor]:
         chunks = -(-len(rays.behind) // shading.CHUNK)
         tensors = ShaderWeights(*weights)
         arrays = (store := shading_store(max(chunks, get_num_threads()), tensors)).arrays
         loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
-        gradients = [torch.empty(x.shape) for x in (features, share, gain)]
+        gradients = [torch.empty(x.shape) for x in (features, share, gain, mirrored)]
         shading.compare(
-            _arrays(rays), _arrays(measured), _array(gain), _arrays(tensors), learn, arrays, loss, squared.numpy(),
+            _arrays(rays), _arrays(measured), _array(gain), _array(mirrored), _arrays(tensors), learn, arrays, loss, squared.numpy(),
             *(g.numpy() for g in gradients),
         )  # fmt: skip
         if learn:
@@ -216,3 +241,36 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     outputs = torch.empty(len(features), len(weights.heads_bias))
     shading.shade(_array(features), _array(directions), degrees, _arrays(weights), outputs.numpy())
     return outputs
+
+
+def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -> Tensor:
+    """See ``mirroring.mirror``; float32, ``measured.ray`` never decreasing. Points and directions with a gradient go to the reference."""
+    if _kept(mirrors.points, mirrors.directions):
+        return reference.mirror(lamps, mirrors, behind, measured)
+    return _Mirror.apply(behind, measured, mirrors, *lamps, mirrors.material, mirrors.normals, mirrors.share)
+
+
+class _Mirror(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, behind: Tensor, measured: Measured, mirrors: Mirrors, *differentiable: Tensor) -> Tensor:
+        position, spectrum, material, normals, share = differentiable
+        out = torch.empty(len(measured.ray))
+        mirrors = mirrors._replace(material=material, normals=normals, share=share)
+        mirroring.mirror(_arrays(Lamps(position, spectrum)), _arrays(mirrors), _array(behind), _arrays(measured), out.numpy())
+        ctx.constants = behind, measured, mirrors.points, mirrors.directions
+        ctx.save_for_backward(*differentiable)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        (behind, measured, points, directions), (position, spectrum, material, normals, share) = ctx.constants, ctx.saved_tensors
+        chunks = -(-len(behind) // mirroring.CHUNK)
+        of_rows = [torch.empty(x.shape) for x in (material, normals, share)]
+        of_lamps = [torch.empty(chunks, *x.shape) for x in (position, spectrum)]
+        mirrors = Mirrors(material, normals, points, directions, share)
+        mirroring.mirror_backward(
+            _arrays(Lamps(position, spectrum)), _arrays(mirrors), _array(behind), _arrays(measured), _array(gradient),
+            mirroring.Gradients(*(x.numpy() for x in (*of_rows, *of_lamps))),
+        )  # fmt: skip
+        return None, None, None, *(x.sum(0) for x in of_lamps), *of_rows

@@ -185,6 +185,7 @@ def _measurements(  # type: ignore[no-untyped-def]
     rays,
     measured,
     gain,
+    mirrored,
     heads,
     heads_bias,
     learn,
@@ -192,6 +193,7 @@ def _measurements(  # type: ignore[no-untyped-def]
     g_hidden,
     g_share,
     g_gain,
+    g_mirrored,
     heads_out,
     heads_bias_out,
 ):
@@ -213,7 +215,7 @@ def _measurements(  # type: ignore[no-untyped-def]
         places[1], rows[1] = behind[o] - first, behind[o]
         surfaces = 2 if behind[o] >= 0 else 1
         outputs = 1 if m < bright else 6
-        seen = np.float32(0.0)
+        seen = mirrored[m] if len(mirrored) else np.float32(0.0)
         for a in range(surfaces):
             h = hidden[places[a]]
             for j in range(outputs):
@@ -244,6 +246,8 @@ def _measurements(  # type: ignore[no-untyped-def]
         pull = measured.weight[m] / level[m] * min(max(relative, -_HUBER), _HUBER)
         if len(gain):
             g_gain[m] = pull * seen * level[m]
+        if len(mirrored):
+            g_mirrored[m] = pull * brightness
         for a in range(surfaces):
             h, g = hidden[places[a]], g_hidden[places[a]]
             if trains_geometry[o]:
@@ -261,7 +265,7 @@ def _measurements(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _first_at(ray, begin):  # type: ignore[no-untyped-def]
+def first_at(ray, begin):  # type: ignore[no-untyped-def]
     """The first measurement of a ray or of those after it, by bisection."""
     low, high = 0, len(ray)
     while low < high:
@@ -286,7 +290,24 @@ class Layers(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _chunk(  # type: ignore[no-untyped-def]
-    begin, count, slot, chunk, rays, measured, gain, layers, heads, heads_bias, learn, store, squared, g_features, g_share, g_gain
+    begin,
+    count,
+    slot,
+    chunk,
+    rays,
+    measured,
+    gain,
+    mirrored,
+    layers,
+    heads,
+    heads_bias,
+    learn,
+    store,
+    squared,
+    g_features,
+    g_share,
+    g_gain,
+    g_mirrored,
 ):
     """The loss of some rays, and its gradients where ``learn``. What is behind these rays are rows that follow each other."""
     x, h1, h2, g1, g2 = store.x[slot], store.h1[slot], store.h2[slot], store.g1[slot], store.g2[slot]
@@ -319,10 +340,11 @@ def _chunk(  # type: ignore[no-untyped-def]
     if learn:
         first_out[:], second_out[:], heads_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         first_bias_out[:], second_bias_out[:], heads_bias_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    span = _first_at(measured.ray, begin), _first_at(measured.ray, begin + count)
+    span = first_at(measured.ray, begin), first_at(measured.ray, begin + count)
     loss = _measurements(
-        begin, span, first, h2, rays, measured, gain, heads, heads_bias, learn, squared, g2, g_share, g_gain, heads_out, heads_bias_out
-    )
+        begin, span, first, h2, rays, measured, gain, mirrored, heads, heads_bias, learn, squared, g2, g_share, g_gain, g_mirrored,
+        heads_out, heads_bias_out,
+    )  # fmt: skip
     if learn:
         _layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
         _clear(g1, rows, units)
@@ -337,8 +359,11 @@ def _chunk(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def compare(rays, measured, gain, weights, learn, store, loss, squared, g_features, g_share, g_gain):  # type: ignore[no-untyped-def]
-    """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` may be empty; the loss and gradients of weights are per chunk.
+def compare(  # type: ignore[no-untyped-def]
+    rays, measured, gain, mirrored, weights, learn, store, loss, squared, g_features, g_share, g_gain, g_mirrored
+):
+    """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` and ``mirrored`` may be empty; the loss and the
+    gradients of weights are per chunk.
 
     store: ``ShadingStore``, whose scratch has a slot per thread.
     """
@@ -351,8 +376,8 @@ def compare(rays, measured, gain, weights, learn, store, loss, squared, g_featur
         chunk, slot = np.int64(task), np.int64(get_thread_id())
         begin = chunk * CHUNK
         loss[chunk] = _chunk(
-            begin, min(CHUNK, total - begin), slot, chunk, rays, measured, gain, layers, weights.heads, weights.heads_bias,
-            learn, store, squared, g_features, g_share, g_gain,
+            begin, min(CHUNK, total - begin), slot, chunk, rays, measured, gain, mirrored, layers, weights.heads, weights.heads_bias,
+            learn, store, squared, g_features, g_share, g_gain, g_mirrored,
         )  # fmt: skip
 
 

@@ -1,0 +1,192 @@
+"""Mirrored lamps on the CPU, fused: all numbers measured along a ray at once, and their gradients in the same pass.
+
+A gradient of a measurement is known up to a factor when it is: ``mirror`` gives the numbers, ``mirror_backward`` is given these factors and
+goes through the same terms again, which is cheaper than to keep them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from mmsynth.field.kernels.constants import LEAST_ROUGHNESS, REFRACTIVE_INDEX
+from mmsynth.field.kernels.cpu.shading import first_at
+
+CHUNK = 64  # rays
+_f = np.float32
+_INDEX, _LEAST, _TINY = _f(REFRACTIVE_INDEX), _f(LEAST_ROUGHNESS), _f(1e-12)
+_AT_NORMAL = _f(((REFRACTIVE_INDEX - 1.0) / (REFRACTIVE_INDEX + 1.0)) ** 2)
+_ZERO, _ONE, _TWO = _f(0.0), _f(1.0), _f(2.0)
+
+
+class Gradients(NamedTuple):
+    """Of ``Mirrors`` per row: material (H, 2 + K), normals (H, 3), share (H,); of the lamps per chunk: position (C, K, 3), spectrum
+    (C, K, outputs)."""
+
+    material: np.ndarray
+    normals: np.ndarray
+    share: np.ndarray
+    position: np.ndarray
+    spectrum: np.ndarray
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _sigmoid(x):  # type: ignore[no-untyped-def]
+    return _ONE / (_ONE + _f(math.exp(-x))) if x >= _ZERO else _f(math.exp(x)) / (_ONE + _f(math.exp(x)))
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _softplus(x):  # type: ignore[no-untyped-def]
+    return max(x, _ZERO) + _f(math.log1p(math.exp(-abs(x))))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _terms(row, k, lamps, mirrors, out):  # type: ignore[no-untyped-def]
+    """See ``mirroring.reflect``, of one surface and lamp.
+
+    out: the lamp's direction 0:3 and distance 3, the half vector 4:7 and its length 7, n × h 8:11, off 11, n·l 12, n·v 13, the two factors
+    below seen 14, 15 (see ``_amount``), 0.25 F or 0 where h is behind 16, axis 17:20, degree 20.
+    """
+    px, py, pz = mirrors.points[row, 0], mirrors.points[row, 1], mirrors.points[row, 2]
+    vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
+    nx, ny, nz = mirrors.normals[row, 0], mirrors.normals[row, 1], mirrors.normals[row, 2]
+    tx, ty, tz = lamps.position[k, 0] - px, lamps.position[k, 1] - py, lamps.position[k, 2] - pz
+    distance = max(_f(math.sqrt(tx * tx + ty * ty + tz * tz)), _TINY)
+    tx, ty, tz = tx / distance, ty / distance, tz / distance
+    hx, hy, hz = tx + vx, ty + vy, tz + vz
+    length = max(_f(math.sqrt(hx * hx + hy * hy + hz * hz)), _TINY)
+    hx, hy, hz = hx / length, hy / length, hz / length
+    wx, wy, wz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
+    out[0], out[1], out[2], out[3] = tx, ty, tz, distance
+    out[4], out[5], out[6], out[7] = hx, hy, hz, length
+    out[8], out[9], out[10], out[11] = wx, wy, wz, wx * wx + wy * wy + wz * wz
+    out[12] = max(nx * tx + ny * ty + nz * tz, _ZERO)
+    out[13] = max(nx * vx + ny * vy + nz * vz, _ZERO)
+    incidence = min(max(vx * hx + vy * hy + vz * hz, _ZERO), _ONE)
+    away = _ONE - incidence
+    fresnel = _ONE + (_ONE / _AT_NORMAL - _ONE) * away * away * away * away * away
+    out[16] = _f(0.25) * fresnel if nx * hx + ny * hy + nz * hz > _ZERO else _ZERO
+    ax, ay, az = vy * hz - vz * hy, vz * hx - vx * hz, vx * hy - vy * hx
+    across = max(_f(math.sqrt(ax * ax + ay * ay + az * az)), _TINY)
+    out[17], out[18], out[19] = ax / across, ay / across, az / across
+    transmitted = _f(math.sqrt(_ONE - (_ONE - incidence * incidence) / (_INDEX * _INDEX)))
+    s = (incidence - _INDEX * transmitted) / (incidence + _INDEX * transmitted)
+    p = (_INDEX * incidence - transmitted) / (_INDEX * incidence + transmitted)
+    out[20] = (s * s - p * p) / (s * s + p * p)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _amount(row, k, raw, terms):  # type: ignore[no-untyped-def]
+    """Relative light of one surface and lamp; fills A and B of the terms."""
+    alpha = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0])
+    square, c = alpha * alpha, _f(0.5) * alpha
+    terms[14] = terms[12] * (_ONE - c) + c
+    terms[15] = terms[13] * (_ONE - c) + c
+    u = square / (square + (_ONE - square) * terms[11])
+    return u * u * terms[12] / (terms[14] * terms[15]) * terms[16] * _softplus(raw[row, 1]) * _sigmoid(raw[row, 2 + k])
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
+    """Share of the light behind an analyser."""
+    e = terms[17] * axes[number, 0] + terms[18] * axes[number, 1] + terms[19] * axes[number, 2]
+    return _f(0.5) * (_ONE + terms[20] * (_TWO * e * e - _ONE))
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
+    """See ``mirroring.mirror``; ``measured.ray`` never decreases."""
+    rays, count = behind.shape[0], lamps.position.shape[0]
+    bright = len(measured.ray) - len(measured.axes)
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        begin = np.int64(task) * CHUNK
+        end = min(begin + CHUNK, rays)
+        terms = np.empty(21, np.float32)
+        for m in range(first_at(measured.ray, begin), first_at(measured.ray, end)):
+            out[m] = _ZERO
+        for o in range(begin, end):
+            first, last = first_at(measured.ray, o), first_at(measured.ray, o + 1)
+            for which in range(2 if behind[o] >= 0 else 1):
+                row = o if which == 0 else behind[o]
+                for k in range(count if mirrors.share[row] > _ZERO else 0):
+                    _terms(row, k, lamps, mirrors, terms)
+                    amount = mirrors.share[row] * _amount(row, k, mirrors.material, terms)
+                    for m in range(first, last):
+                        passed = _ONE if m < bright else _passed(terms, measured.axes, m - bright)
+                        out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
+    """g: (M,) gradients of the numbers; out: ``Gradients``."""
+    rays, count = behind.shape[0], lamps.position.shape[0]
+    bright = len(measured.ray) - len(measured.axes)
+    g_material, g_normals, g_share, g_position, g_spectrum = out.material, out.normals, out.share, out.position, out.spectrum
+    raw = mirrors.material
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        chunk = np.int64(task)
+        begin = chunk * CHUNK
+        terms = np.empty(21, np.float32)
+        g_position[chunk], g_spectrum[chunk] = _ZERO, _ZERO
+        for o in range(begin, min(begin + CHUNK, rays)):
+            first, last = first_at(measured.ray, o), first_at(measured.ray, o + 1)
+            for which in range(2 if behind[o] >= 0 else 1):
+                row = o if which == 0 else behind[o]
+                g_share[row] = _ZERO
+                g_normals[row] = _ZERO
+                g_material[row] = _ZERO
+                share = mirrors.share[row]
+                if share <= _ZERO:
+                    continue
+                gate = _sigmoid(raw[row, 0])
+                alpha = _LEAST + (_ONE - _LEAST) * gate
+                square, c = alpha * alpha, _f(0.5) * alpha
+                strength, slope = _softplus(raw[row, 1]), _sigmoid(raw[row, 1])
+                g_alpha = _ZERO
+                for k in range(count):
+                    _terms(row, k, lamps, mirrors, terms)
+                    amount = _amount(row, k, raw, terms)
+                    pull = _ZERO
+                    for m in range(first, last):
+                        passed = g[m] if m < bright else g[m] * _passed(terms, measured.axes, m - bright)
+                        pull += passed * lamps.spectrum[k, measured.output[m]]
+                        g_spectrum[chunk, k, measured.output[m]] += passed * share * amount
+                    g_share[row] += pull * amount
+                    if terms[16] == _ZERO:
+                        continue
+                    pull *= share
+                    visible = _sigmoid(raw[row, 2 + k])
+                    rest = terms[16] * strength * visible
+                    off, nl, nv, a, b = terms[11], terms[12], terms[13], terms[14], terms[15]
+                    under = square + (_ONE - square) * off
+                    u = square / under
+                    lobe, seen = u * u, nl / (a * b)
+                    g_material[row, 1] += pull * terms[16] * visible * lobe * seen * slope
+                    g_material[row, 2 + k] += pull * rest * lobe * seen * (_ONE - visible)
+                    g_off = -pull * rest * seen * _TWO * lobe * (_ONE - square) / under
+                    g_square = pull * rest * seen * _TWO * u * off / (under * under)
+                    g_nl = pull * rest * lobe * c / (a * a * b) if nl > _ZERO else _ZERO
+                    g_nv = -pull * rest * lobe * nl * (_ONE - c) / (a * b * b) if nv > _ZERO else _ZERO
+                    g_c = -pull * rest * lobe * nl * ((_ONE - nl) / (a * a * b) + (_ONE - nv) / (a * b * b))
+                    g_alpha += g_square * _TWO * alpha + _f(0.5) * g_c
+                    nx, ny, nz = mirrors.normals[row, 0], mirrors.normals[row, 1], mirrors.normals[row, 2]
+                    tx, ty, tz, hx, hy, hz = terms[0], terms[1], terms[2], terms[4], terms[5], terms[6]
+                    wx, wy, wz = terms[8], terms[9], terms[10]
+                    q = _TWO * g_off
+                    # |n × h|²: to n it is 2 h × (n × h), to h 2 (n × h) × n
+                    g_normals[row, 0] += q * (hy * wz - hz * wy) + g_nl * tx - g_nv * mirrors.directions[row, 0]
+                    g_normals[row, 1] += q * (hz * wx - hx * wz) + g_nl * ty - g_nv * mirrors.directions[row, 1]
+                    g_normals[row, 2] += q * (hx * wy - hy * wx) + g_nl * tz - g_nv * mirrors.directions[row, 2]
+                    ghx, ghy, ghz = q * (wy * nz - wz * ny), q * (wz * nx - wx * nz), q * (wx * ny - wy * nx)
+                    along = ghx * hx + ghy * hy + ghz * hz
+                    gtx = g_nl * nx + (ghx - along * hx) / terms[7]
+                    gty = g_nl * ny + (ghy - along * hy) / terms[7]
+                    gtz = g_nl * nz + (ghz - along * hz) / terms[7]
+                    along = gtx * tx + gty * ty + gtz * tz
+                    g_position[chunk, k, 0] += (gtx - along * tx) / terms[3]
+                    g_position[chunk, k, 1] += (gty - along * ty) / terms[3]
+                    g_position[chunk, k, 2] += (gtz - along * tz) / terms[3]
+                g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate * (_ONE - gate)

@@ -1,0 +1,98 @@
+"""Lamps, and how rough and how strong surfaces mirror them: the part of radiance that moves with the viewer.
+
+What a sensor sees of a surface is a diffuse part, which the shader paints, and the images of the lamps, blurred by the surface's
+roughness (see ``kernels.mirroring`` for the model). Normals are gradients of the distance, so that highlights, and their polarization,
+shape the surface.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from mmsynth.field.kernels import Lamps, Reflection
+
+LAMPS = 6  # at the most
+_HIDDEN = 32
+_START = (-1.0, -2.0, 2.0)  # roughness, strength and visibility before their functions: 0.28, 0.13, 0.88
+
+
+class Light(nn.Module):
+    """Lamps, and what a surface does with them, from its features.
+
+    Args:
+        features: of a surface. outputs: of the shader, each with the lamps' light in it (the first of six of a polarization).
+    Attributes:
+        position: (LAMPS, 3), normalised frame. log_spectrum: (LAMPS, outputs), relative to each modality's typical value.
+        count: () int64, how many lamps there are; the others are not used.
+    """
+
+    count: Tensor
+
+    def __init__(self, features: int, outputs: int) -> None:
+        super().__init__()
+        self.first, self.second = nn.Linear(features, _HIDDEN), nn.Linear(_HIDDEN, 2 + LAMPS)
+        with torch.no_grad():
+            self.second.bias.copy_(torch.tensor([*_START[:2], *[_START[2]] * LAMPS]))
+        self.position = nn.Parameter(torch.zeros(LAMPS, 3))
+        self.log_spectrum = nn.Parameter(torch.zeros(LAMPS, outputs))
+        self.register_buffer("count", torch.tensor(0))
+
+    def put(self, positions: Tensor) -> None:
+        """Lamps as bright as the scene, at (K, 3)."""
+        with torch.no_grad():
+            self.position[: len(positions)] = positions
+            self.count.fill_(len(positions))
+
+    def material(self, features: Tensor) -> Tensor:
+        """What surfaces do with the lamps, (H, F) → (H, 2 + K): see ``kernels.mirroring.material``."""
+        return self.second(torch.relu(self.first(features)))[:, : 2 + int(self.count)]
+
+    def lamps(self) -> Lamps:
+        """What the kernels take."""
+        count = int(self.count)
+        return Lamps(self.position[:count], torch.exp(self.log_spectrum[:count]))
+
+
+def stokes(reflection: Reflection, spectrum: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Stokes vectors (H, 3) of what is mirrored, in the frame of axes x, y (H, 3), of lamps of ``spectrum`` (K,)."""
+    light = reflection.amount * spectrum
+    on_x, on_y = ((reflection.axis * axis[:, None]).sum(-1) for axis in (x, y))
+    polarized = light * reflection.degree
+    parts = light, polarized * (on_x.square() - on_y.square()), polarized * 2.0 * on_x * on_y
+    return torch.stack([part.sum(1) for part in parts], -1)
+
+
+_DIRECTIONS = 1500  # about 5 degrees apart
+_CONCENTRATION = 40.0  # of a ray's vote: 9 degrees wide
+_APART = math.cos(math.radians(30.0))
+_LEAST_VOTE = 0.3  # of the best direction's
+_PRIOR = 0.25  # votes without light that every direction has beside its own, of the most that any has
+
+
+def find_lamps(reflected: Tensor, light: Tensor) -> Tensor:
+    """Directions (K, 3) of lamps: where mirrored rays that are brighter than their surface go.
+
+    Args:
+        reflected: (N, 3) directions of rays after the mirror. light: (N,) ≥ 0, what they saw beyond the surface's own.
+    """
+    if not bool((light > 0).any()):
+        return reflected[:0]
+    i = torch.arange(_DIRECTIONS, dtype=torch.float32, device=light.device) + 0.5
+    z = 1.0 - 2.0 * i / _DIRECTIONS
+    turn, radius = math.pi * (1.0 + math.sqrt(5.0)) * i, torch.sqrt(1.0 - z * z)
+    sphere = torch.stack([radius * torch.cos(turn), radius * torch.sin(turn), z], -1)  # Fibonacci's
+    bright, rays = torch.zeros_like(z), torch.zeros_like(z)
+    for part, weight in zip(reflected.split(8192), light.split(8192), strict=True):
+        votes = torch.exp(_CONCENTRATION * (part @ sphere.T - 1.0))
+        bright, rays = bright + weight @ votes, rays + votes.sum(0)
+    score = bright / (rays + _PRIOR * rays.max())
+    least = _LEAST_VOTE * score.max()
+    found: list[Tensor] = []
+    while len(found) < LAMPS and bool(score.max() > least):
+        best = sphere[score.argmax()]
+        found.append(best)
+        score = score.masked_fill(sphere @ best > _APART, 0.0)
+    return torch.stack(found)

@@ -1,0 +1,116 @@
+"""Do surfaces of this scene mirror lamps? Residuals of a field say where lamps may be, and after a trial whether they are needed."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmsynth.field import kernels, rendering
+from mmsynth.field.field import Field
+from mmsynth.field.light import find_lamps
+from mmsynth.field.radiance import Shader
+from mmsynth.fitting.choices import Choice, switch
+from mmsynth.fitting.decisions import DEGREES
+from mmsynth.fitting.measurements import Batch, Measurements, draw
+from mmsynth.fitting.optimiser import Adam
+from mmsynth.fitting.recipe import RadianceRecipe
+
+_RAYS = 4096  # per modality
+_STEPS = 40
+_RATE = 4e-3
+_FARTHER = 2.0  # than the cameras: where lamps are looked for first
+_BRIGHTEST = 3.0  # times the typical value: what is brighter does not say more
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Rays of all modalities and the surfaces that they met, H of them: points, normals and the rays' directions (H, 3)."""
+
+    batch: Batch
+    hits: kernels.Hits
+    points: Tensor
+    normals: Tensor
+    directions: Tensor
+
+
+@torch.no_grad()
+def _look(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> _Look:
+    random = np.random.default_rng((seed, 9))
+    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random, field.device)
+    jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
+    hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+    ray = kernels.rays_of(hits.behind)
+    points = batch.origins[ray] + batch.directions[ray] * hits.distance[:, None]
+    normals = field.normals(points, field.slopes(points, sampling.active_surface))
+    return _Look(batch, hits, points, normals, batch.directions[ray])
+
+
+@torch.no_grad()
+def look_for_lamps(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> int:
+    """Put lamps into a field's light where mirrored rays are brighter than their surfaces: how many.
+
+    The directions are those of ``find_lamps``, the distance is a guess that the fit improves.
+    """
+    if field.light is None:
+        return 0
+    look = _look(field, measurements, sampling, seed)
+    hits, m, rays = look.hits, look.batch.measured, len(look.batch.origins)
+    degrees = look.batch.per_ray(field.view_dependence)[kernels.rays_of(hits.behind)]
+    outputs = field.shader(hits.features, look.directions, degrees)
+    more = (m.target - kernels.predict(outputs, hits.share, m, hits.behind)) / m.level
+    # a lamp is brighter in every number of a ray
+    least = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, more, "amin", include_self=False).clamp(0.0, _BRIGHTEST)
+    chosen = (hits.share[:rays] > 0.5) & (torch.linalg.vector_norm(look.points[:rays], dim=-1) < 1.0)
+    d, n = look.batch.directions[chosen], look.normals[:rays][chosen]
+    lamps = find_lamps(d - 2.0 * (d * n).sum(-1, keepdim=True) * n, least[chosen])
+    cameras = np.concatenate([np.linalg.norm(m.origins, axis=1) for m in measurements.values()])
+    field.light.put(lamps * _FARTHER * max(float(np.median(cameras)), 1.0))
+    return len(lamps)
+
+
+def decide_light(
+    field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int
+) -> Choice[bool]:
+    """Whether the lamps of a field that has learned with them are worth it.
+
+    Two copies of the shader learn on from half of some rays, geometry and features held fixed, one of them without the lamps; on the
+    other half they are compared.
+    """
+    if recipe.light == "off":
+        return switch(False, "asked for by the recipe")
+    if not field.shines:
+        return switch(False, "from no direction surfaces are brighter than from others")
+    look = _look(field, measurements, sampling, seed)
+    batch = look.batch
+    mirrored = field.mirrored(look.hits, batch.origins, batch.directions, batch.measured, sampling.active_surface).detach()
+    lit, unlit = (_error(field.shader, look, light) for light in (mirrored, torch.zeros_like(mirrored)))
+    saved = 1.0 - lit / unlit if unlit > 0 else 0.0
+    count = 0 if field.light is None else int(field.light.count)
+    why = f"{count} lamps, mirrored, save {saved:.1%} of the error of rays not learned from"
+    if recipe.light == "on":
+        return switch(True, f"asked for by the recipe; {why}")
+    worth = recipe.light_min_improvement
+    return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.0%} asked for")
+
+
+def _error(shader: Shader, look: _Look, mirrored: Tensor) -> float:
+    """Mean over modalities of the squared error at rays of odd number, relative to the modality's level, after a copy of the shader has
+    learned from the others, beside mirrored light (M,)."""
+    m, hits = look.batch.measured, look.hits
+    learned, usable = m.ray % 2 == 0, m.target < m.saturation
+    candidate = copy.deepcopy(shader)
+    parameters = dict(candidate.named_parameters())
+    optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
+    for step in range(_STEPS + 1):
+        predicted = kernels.predict(candidate(hits.features, look.directions, DEGREES), hits.share, m, hits.behind)
+        difference = kernels.residual(predicted + mirrored, m)
+        if step < _STEPS:
+            kernels.photometric(difference * learned, m).backward()
+            optimiser.step(1.0 - step / _STEPS)
+    relative = (difference / m.level).detach().square()
+    errors = [relative[numbers][(~learned & usable)[numbers]].mean() for _, numbers in look.batch.parts.values()]
+    return float(torch.stack(errors).nanmean())
