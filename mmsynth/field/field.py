@@ -24,7 +24,7 @@ from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 
 TILE = 8192  # rays at a time: what they need stays in the caches
-_NORMAL_CELLS = 2.0  # over which normals are differences: fewer have the grid's noise in them
+MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
 
@@ -173,9 +173,9 @@ class Field(nn.Module):
         mixed = (passed / share.clamp(min=LEAST_WEIGHT))[:, None]
         return hits._replace(features=torch.lerp(hits.features, self.far_light.expand_as(hits.features), mixed), share=share)
 
-    def slopes(self, points: Tensor, active: int) -> Tensor:
-        """∇sdf (N, 3) in the frame of the grid, at points (N, 3) of the normalised frame."""
-        return self.surface.gradient(self.surface.grid.to_grid(points), _NORMAL_CELLS * self.surface.grid.cell(active), active)
+    def slopes(self, points: Tensor, active: int, cells: float = 1.0) -> Tensor:
+        """∇sdf (N, 3) in the frame of the grid, at points (N, 3) of the normalised frame, by differences over so many cells."""
+        return self.surface.gradient(self.surface.grid.to_grid(points), cells * self.surface.grid.cell(active), active)
 
     def normals(self, points: Tensor, slopes: Tensor) -> Tensor:
         """Unit, outward (N, 3), in the normalised frame, from ``slopes`` at these points."""
@@ -269,7 +269,7 @@ class Field(nn.Module):
             raise ValueError("a field without light")
         ray = kernels.rays_of(hits.behind)
         points = origins[ray] + directions[ray] * hits.distance[:, None]
-        slopes = self.slopes(points.detach(), active)
+        slopes = self.slopes(points.detach(), active, MIRROR_CELLS)
         normals = self.normals(points.detach(), slopes)
         return kernels.Mirrors(self.light.material(hits.features), normals, points, directions[ray], hits.share), slopes
 

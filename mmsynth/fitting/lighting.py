@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.field import kernels, rendering
-from mmsynth.field.field import Field
+from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.choices import Choice, switch
@@ -45,7 +45,7 @@ def _look(field: Field, measurements: dict[str, Measurements], sampling: kernels
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
     ray = kernels.rays_of(hits.behind)
     points = batch.origins[ray] + batch.directions[ray] * hits.distance[:, None]
-    normals = field.normals(points, field.slopes(points, sampling.active_surface))
+    normals = field.normals(points, field.slopes(points, sampling.active_surface, MIRROR_CELLS))
     return _Look(batch, hits, points, normals, batch.directions[ray])
 
 

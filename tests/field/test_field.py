@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.kernels import intensity, radiance
+from mmsynth.field.light import Light
 from mmsynth.field.radiance import Shader
 from mmsynth.field.storage import load_field, save_field
 from mmsynth.scene.scene import Region, Sensor
@@ -160,9 +162,35 @@ def test_every_modality_has_the_view_dependence_that_it_needs() -> None:
         torch.testing.assert_close(out[name], expected.detach(), atol=1e-6, rtol=1e-5)
 
 
+def test_what_is_rendered_of_lamps_is_what_a_fit_compares() -> None:
+    field = _field(True)
+    plain = _look_around(field, 200)[2]
+    field.light = Light(field.appearance.width, field.shader.heads.out_features)
+    origins, directions, out = _look_around(field, 200)
+    assert all(torch.equal(out[name].nan_to_num(), plain[name].nan_to_num()) for name in plain)  # there are no lamps yet
+    field.light.put(torch.tensor([[0.0, 0.0, 3.0], [2.0, 2.0, -1.0]]))
+    origins, directions, out = _look_around(field, 200)
+    hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((200,), 0.5), field.sampling)
+    ray = torch.arange(200)
+    for name in ("rgb", "nir"):
+        column = field.shader.columns[name].start
+        level = torch.full((200,), LEVELS[name])
+        measured = kernels.Measured(level, ray, torch.full_like(ray, column), torch.empty(0, 3), level, level, level)
+        expected = field.mirrored(hits, origins, directions, measured, field.sampling.active_surface).detach()
+        torch.testing.assert_close(out[name][:, 0] - plain[name][:, 0], expected, atol=1e-6, rtol=1e-5)
+        assert (expected > 1e-3).sum() > 20
+    hit = out["normal"].isfinite().all(1)
+    assert hit.sum() > 100 and float((out["normal"][hit] * plain["normal"][hit]).sum(1).quantile(0.1)) > 0.98
+
+
+@pytest.mark.parametrize("lit", [False, True])
 @pytest.mark.parametrize("background", [False, True])
-def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool) -> None:
+def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool, lit: bool) -> None:
     field = _field(background, Region((1.0, 2.0, 3.0), 0.5))
+    if lit:
+        field.design = dataclasses.replace(field.design, light=True)
+        field.light = Light(field.appearance.width, field.shader.heads.out_features)
+        field.light.put(torch.ones(2, 3))
     field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
     field.occupancy.states[3, 4, 5] = 17
     field.sensors["nir"] = replace(NIR, saturation=float("inf"), mosaic=np.array([[0]]))

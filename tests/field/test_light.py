@@ -1,0 +1,149 @@
+"""Mirrored lamps: the fused kernel against the definition, the definition against closed forms, rendering against what a fit compares."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from mmsynth.field import kernels
+from mmsynth.field.kernels import Lamps, Measured, Mirrors
+from mmsynth.field.kernels.mirroring import material, reflect
+from mmsynth.field.light import LAMPS, Light, find_lamps, stokes
+from mmsynth.sensors.polarization import stokes_to_intensities
+
+OUTPUTS = 9
+
+
+def _case(rays: int, per_ray: int = 1, lamps: int = 3, polarized: float = 0.4) -> tuple[Lamps, Mirrors, Tensor, Measured]:
+    """Surfaces of all roughnesses, seen and lit from all sides; a third of the rays meets two, a fifth nothing."""
+    g = torch.Generator().manual_seed(rays + per_ray)
+    normal = lambda *shape: torch.randn(*shape, generator=g)
+    twice = torch.nonzero(torch.rand(rays, generator=g) < 0.3)[:, 0]
+    behind = torch.full((rays,), -1)
+    behind[twice] = torch.arange(rays, rays + len(twice))
+    rows = rays + len(twice)
+    normals = normalize(normal(rows, 3), dim=1)
+    share = torch.rand(rows, generator=g)
+    share[:rays][(torch.rand(rays, generator=g) < 0.2) & (behind < 0)] = 0.0
+    mirrors = Mirrors(
+        2.0 * normal(rows, 2 + lamps), normals, 0.5 * normal(rows, 3), normalize(0.7 * normal(rows, 3) - normals, dim=1), share
+    )
+    ray = torch.arange(rays).repeat_interleave(per_ray)
+    axes = normalize(normal(int(polarized * rays) * per_ray, 3), dim=1)
+    output = torch.randint(3, (len(ray),), generator=g)
+    output[len(ray) - len(axes) :] = 3
+    one = torch.ones(len(ray))
+    spectrum = torch.rand(lamps, OUTPUTS, generator=g) + 0.5
+    return Lamps(4.0 * normalize(normal(lamps, 3), dim=1), spectrum), mirrors, behind, Measured(one, ray, output, axes, one, one, one)
+
+
+def _quantities(case: tuple[Lamps, Mirrors, Tensor, Measured], dtype: torch.dtype) -> dict[str, Tensor]:
+    lamps, mirrors, behind, measured = case
+    to = lambda parts: type(parts)(*(x.detach().clone().to(dtype) for x in parts))
+    lamps, mirrors = to(lamps), to(mirrors)
+    of_mirrors = {name: getattr(mirrors, name) for name in ("material", "normals", "share")}
+    differentiable = {"position": lamps.position, "spectrum": lamps.spectrum, **of_mirrors}
+    for x in differentiable.values():
+        x.requires_grad_()
+    seen = kernels.mirror(lamps, mirrors, behind, measured._replace(axes=measured.axes.to(dtype)))
+    (seen * torch.linspace(0.5, 1.5, len(seen), dtype=dtype)).sum().backward()
+    return {"light": seen.detach(), **{f"gradient of {n}": x.grad for n, x in differentiable.items() if x.grad is not None}}
+
+
+@pytest.mark.parametrize(
+    ("rays", "per_ray", "lamps", "polarized"), [(300, 1, 3, 0.4), (64, 3, 1, 0.0), (65, 2, LAMPS, 1.0), (1, 1, 2, 0.0)]
+)
+def test_fused_is_the_definition(rays: int, per_ray: int, lamps: int, polarized: float) -> None:
+    case = _case(rays, per_ray, lamps, polarized)
+    found, expected = _quantities(case, torch.float32), _quantities(case, torch.float64)
+    assert len(found) == 6 and expected["light"].any()
+    for name, value in found.items():
+        assert value.dtype == torch.float32 and torch.isfinite(value).all(), name
+        assert float((value - expected[name]).abs().max()) <= 5e-6 * float(expected[name].abs().max()) + 1e-12, name
+
+
+def test_no_rays() -> None:
+    found = _quantities(_case(0), torch.float32)
+    assert len(found["light"]) == 0 and not any(x.any() for x in found.values())
+
+
+def test_the_gradient_of_the_definition_is_that_of_differences() -> None:
+    lamps, mirrors, behind, measured = _case(12, 2)
+    to = lambda x: x.double().requires_grad_()
+    measured = measured._replace(axes=measured.axes.double())
+
+    def seen(spectrum: Tensor, material: Tensor, share: Tensor) -> Tensor:
+        parts = Mirrors(material, mirrors.normals.double(), mirrors.points.double(), mirrors.directions.double(), share)
+        return kernels.mirror(Lamps(lamps.position.double(), spectrum), parts, behind, measured)
+
+    shared = mirrors.share.clamp(min=0.1)
+    assert torch.autograd.gradcheck(seen, (to(lamps.spectrum), to(mirrors.material), to(shared)))
+
+
+def _one(
+    normal: list[float], viewer: list[float], lamp: list[float], raw: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> kernels.Reflection:
+    """One surface at the origin, seen from and lit from directions."""
+    vector = lambda x: normalize(torch.tensor([x], dtype=torch.float64), dim=1)
+    mirrors = Mirrors(
+        torch.tensor([raw], dtype=torch.float64), vector(normal), torch.zeros(1, 3, dtype=torch.float64), -vector(viewer), torch.ones(1)
+    )
+    return reflect(5.0 * vector(lamp), mirrors)
+
+
+def test_polarization_is_fresnels() -> None:
+    """None head on; all of it at Brewster's angle, tan θ = 1.5, perpendicular to the plane of incidence."""
+    assert float(_one([0, 0, 1], [0, 0, 1], [0, 0, 1]).degree) == pytest.approx(0.0, abs=1e-12)
+    brewster = _one([0, 0, 1], [1.5, 0, 1], [-1.5, 0, 1])
+    assert float(brewster.degree) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(brewster.axis[0, 0].abs(), [0.0, 1.0, 0.0], atol=1e-12)
+
+
+def test_a_mirror_is_brightest_where_the_angles_are_equal() -> None:
+    """At the top of a lobe L = s V F / F(1) n·l / 4 (...): the closed form, and less beside it."""
+    raw = (-2.0, 1.0, 3.0)
+    alpha, strength, visibility = (float(x) for x in material(torch.tensor([raw], dtype=torch.float64)))
+    cos = math.cos(math.radians(40.0))
+    c = 0.5 * alpha
+    seen = cos / (cos * (1 - c) + c) ** 2
+    top = 0.25 * (1.0 + 24.0 * (1.0 - cos) ** 5) * seen * strength * visibility
+    side = math.sin(math.radians(40.0))
+    assert float(_one([0, 0, 1], [side, 0, cos], [-side, 0, cos], raw).amount) == pytest.approx(top, rel=1e-12)
+    assert all(float(_one([x, y, 1], [side, 0, cos], [-side, 0, cos], raw).amount) < top for x, y in ((0.1, 0), (-0.1, 0), (0, 0.1)))
+
+
+def test_stokes_vectors_are_what_analysers_pass() -> None:
+    """The rendering's Stokes vectors, behind analysers, are the fit's numbers."""
+    lamps, mirrors, behind, measured = _case(40, 1, polarized=1.0)
+    mirrors, behind = Mirrors(*(x[:40] for x in mirrors)), torch.full((40,), -1)
+    x = normalize(torch.linalg.cross(mirrors.directions, mirrors.normals), dim=1)
+    y = torch.linalg.cross(x, mirrors.directions)
+    for angle in (0.0, 30.0, 100.0):
+        turned = math.radians(angle)
+        found = kernels.mirror(lamps, mirrors, behind, measured._replace(axes=math.cos(turned) * x + math.sin(turned) * y))
+        vectors = mirrors.share[:, None] * stokes(reflect(lamps.position, mirrors), lamps.spectrum[:, 3], x, y)
+        torch.testing.assert_close(found, stokes_to_intensities(vectors, (angle,))[:, 0], atol=1e-6, rtol=1e-5)
+        assert (vectors[:, 1:].norm(dim=1) <= vectors[:, 0] * (1 + 1e-6)).all()
+
+
+def test_lamps_are_found_where_mirrored_rays_are_bright() -> None:
+    g = torch.Generator().manual_seed(3)
+    true = normalize(torch.tensor([[0.5, 0.4, 0.8], [-0.7, 0.2, 0.6], [0.1, -0.9, 0.4]]), dim=1)
+    reflected = normalize(torch.randn(20000, 3, generator=g), dim=1)
+    light = torch.exp(60.0 * (reflected @ true.T - 1.0)).sum(1) + 0.05 * torch.rand(20000, generator=g)
+    found = find_lamps(reflected, light)
+    assert len(found) == 3 and float((found @ true.T).amax(0).min()) > math.cos(math.radians(6.0))
+    assert len(find_lamps(reflected, torch.zeros(20000))) == 0
+
+
+def test_a_light_has_as_many_lamps_as_were_put() -> None:
+    light = Light(8, OUTPUTS)
+    assert light.material(torch.randn(5, 8)).shape == (5, 2) and light.lamps().spectrum.shape == (0, OUTPUTS)
+    light.put(torch.ones(2, 3))
+    assert light.material(torch.randn(5, 8)).shape == (5, 4) and light.lamps().position.shape == (2, 3)
+    assert torch.equal(light.lamps().spectrum, torch.ones(2, OUTPUTS))
