@@ -178,6 +178,31 @@ def _compare(backend: Any) -> Callable[[Inputs], Outputs]:
     return call
 
 
+def _mirror_inputs(samples: int) -> Inputs:
+    """As many rays before three lamps, each with one number, the last half behind analysers."""
+    g, tensors = _generator(), samples // 2
+    unit = lambda count: nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    normals, one = unit(samples), torch.ones(samples)
+    seen = {"target": one, "ray": torch.arange(samples), "level": one, "saturation": one, "weight": one}
+    output = torch.cat([torch.randint(3, (samples - tensors,), generator=g), torch.full((tensors,), 3)])
+    return {
+        "position": 4.0 * unit(3), "spectrum": torch.rand(3, 9, generator=g) + 0.5, "material": torch.randn(samples, 5, generator=g),
+        "normals": normals, "points": 0.5 * torch.randn(samples, 3, generator=g), "share": torch.rand(samples, generator=g),
+        "directions": nn.functional.normalize(0.7 * unit(samples) - normals, dim=1), "behind": torch.full((samples,), -1),
+        "output": output, "axes": unit(tensors), **seen,
+    }  # fmt: skip
+
+
+def _mirror(backend: Any) -> Callable[[Inputs], Outputs]:
+    def call(x: Inputs) -> Outputs:
+        lamps, mirrors, measured = (
+            kind(*(x[name] for name in kind._fields)) for kind in (kernels.Lamps, kernels.Mirrors, kernels.Measured)
+        )
+        return (backend.mirror(lamps, mirrors, x["behind"], measured),)
+
+    return call
+
+
 def _adam_inputs(samples: int) -> Inputs:
     g = _generator()
     parameter, gradient, first, second = torch.randn(4, samples, generator=g)
@@ -251,8 +276,14 @@ OPERATIONS: tuple[Operation, ...] = (
         "compare",
         _compare_inputs,
         {"torch": _compare(reference), "numba": _compare(cpu), "torch cuda": _compare(reference)},
-        leaves=lambda x: [*x["shader"].parameters(), x["features"], x["opacity"]],
+        leaves=lambda x: [*x["shader"].parameters(), x["features"], x["share"]],
         count=lambda output: len(output[1]),
+    ),
+    Operation(
+        "mirror",
+        _mirror_inputs,
+        {"torch": _mirror(reference), "numba": _mirror(cpu), "torch cuda": _mirror(reference)},
+        leaves=lambda x: [x["material"], x["normals"], x["share"], x["position"], x["spectrum"]],
     ),
     Operation(
         "adam",

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize, softplus
 
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID, Rays, Sampling, reference
-from mmsynth.field.kernels.reference import spherical_harmonics
+from mmsynth.field.kernels.shading import HARMONIC_DEGREES, spherical_harmonics
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.rendering import ball_interval
 from mmsynth.field.surface import Surface
@@ -84,7 +84,7 @@ def test_harmonics_are_orthonormal_and_in_the_order_of_their_degrees() -> None:
     mixed = np.linalg.lstsq(y, spherical_harmonics(torch.from_numpy(d @ turn.T)).numpy(), rcond=None)[0]
     degree = np.repeat(np.arange(4), 2 * np.arange(4) + 1)
     assert np.abs(mixed[degree[:, None] != degree]).max() < 1e-12
-    assert reference.HARMONIC_DEGREES.tolist() == degree.tolist()
+    assert HARMONIC_DEGREES.tolist() == degree.tolist()
 
 
 # --- surface

@@ -1,8 +1,9 @@
 """The operations that a field is made of: tensors in, tensors out. The back end follows the tensors.
 
-numba for float32 on the CPU (``cpu``), Triton for float32 on a GPU where it runs (``cuda``), torch elsewhere. ``reference`` defines every
-operation; docstrings are there. Each back end has all of them under the same names: its own, the reference's, or the reference's made of
-its own parts. ``parameters`` says what they take, ``constants`` what they agree on. README.md says how to add one.
+numba for float32 on the CPU (``cpu``), Triton for float32 on a GPU where it runs (``cuda``), torch elsewhere. ``reference``, with
+``shading`` and ``mirroring``, defines every operation; docstrings are there. Each back end has all of them under the same names: its own,
+the reference's, or the reference's made of its own parts. ``parameters`` says what they take, ``constants`` what they agree on.
+README.md says how to add one.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from mmsynth.field.kernels.parameters import (
     ShaderWeights,
     SurfaceNetwork,
 )
-from mmsynth.field.kernels.reference import contract, contracted_velocity, intensity, photometric, predict, radiance, rays_of, residual
+from mmsynth.field.kernels.reference import contract, contracted_velocity
+from mmsynth.field.kernels.shading import intensity, photometric, predict, radiance, rays_of, residual
 
 __all__ = [
     "OUTSIDE", "SHELL", "SOLID", "GridTable", "Hits", "Lamps", "Measured", "Mirrors", "Rays", "Reflection", "Samples", "Sampling",

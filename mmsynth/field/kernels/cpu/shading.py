@@ -163,7 +163,7 @@ def _softplus(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
-    """|Lᵀ e|² (see ``reference.intensity``) and its slope, both of six numbers."""
+    """|Lᵀ e|² (see ``shading.intensity`` of the definition) and its slope, both of six numbers."""
     two = np.float32(2.0)
     a, slope_a = _softplus(raw[0])
     b, slope_b = _softplus(raw[1])
@@ -178,25 +178,9 @@ def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
 def _measurements(  # type: ignore[no-untyped-def]
-    begin,
-    span,
-    first,
-    hidden,
-    rays,
-    measured,
-    gain,
-    mirrored,
-    heads,
-    heads_bias,
-    learn,
-    squared,
-    g_hidden,
-    g_share,
-    g_gain,
-    g_mirrored,
-    heads_out,
-    heads_bias_out,
-):
+    begin, span, first, hidden, rays, measured, gain, mirrored, heads, heads_bias, learn, squared, g_hidden, g_share, g_gain, g_mirrored,
+    heads_out, heads_bias_out,
+):  # fmt: skip
     """What was measured along the rays of a chunk, of which ``begin`` is the first: the loss. Gradients are added to.
 
     span: of the measurements, the first and where they end. hidden: (n, H), a row per surface; what is behind a ray is at its row less
@@ -290,25 +274,9 @@ class Layers(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _chunk(  # type: ignore[no-untyped-def]
-    begin,
-    count,
-    slot,
-    chunk,
-    rays,
-    measured,
-    gain,
-    mirrored,
-    layers,
-    heads,
-    heads_bias,
-    learn,
-    store,
-    squared,
-    g_features,
-    g_share,
-    g_gain,
-    g_mirrored,
-):
+    begin, count, slot, chunk, rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, squared, g_features, g_share,
+    g_gain, g_mirrored,
+):  # fmt: skip
     """The loss of some rays, and its gradients where ``learn``. What is behind these rays are rows that follow each other."""
     x, h1, h2, g1, g2 = store.x[slot], store.h1[slot], store.h2[slot], store.g1[slot], store.g2[slot]
     first_out, first_bias_out, second_out = store.first_out[chunk], store.first_bias_out[chunk], store.second_out[chunk]

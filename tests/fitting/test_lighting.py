@@ -1,0 +1,109 @@
+"""Lamps that a fit looks for, tries and decides on."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mmsynth.field.storage import load_field
+from mmsynth.fitting.lighting import decide_light, look_for_lamps
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.run import fit
+from mmsynth.fitting.schedule import sampling_at
+from mmsynth.fitting.trainer import Trainer
+from mmsynth.packaged import data_folder
+from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import Scene
+
+SMALL = Recipe().with_changes({
+    "sampling.samples_per_step": 2048, "surface.levels": 3, "surface.max_rows_log2": 12, "radiance.levels": 3, "radiance.max_rows_log2": 12,
+    "sampling.occupancy_resolution": 24, "poses.views": "off", "poses.rig": "off",
+})  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene(data_folder("example_scene"), modalities=["rgb", "pol"])
+
+
+def _trainer(scene: Scene, light: str, steps: int = 40) -> Trainer:
+    return Trainer(scene, SMALL.with_changes({"radiance.light": light}), steps, None, 0, "cpu")
+
+
+def _ready(scene: Scene) -> tuple[Trainer, Any]:
+    """A field with lamps, some steps on."""
+    trainer = _trainer(scene, "on")
+    while trainer.progress < 0.4:
+        trainer.run_step()
+    return trainer, sampling_at(0.4, trainer.recipe, trainer.needs)
+
+
+def test_lamps_are_tried_and_then_decided_on(scene: Scene) -> None:
+    trainer = _trainer(scene, "on")
+    news = []
+    for _ in range(40):
+        trainer.run_step()
+        news.append((trainer.state.lamps_sought, trainer.field.shines, trainer.state.light is not None))
+    # at 0.3 of 40 steps, and at 0.45
+    assert [sum(column) for column in zip(*news, strict=True)] == [28, 28, 22]
+    assert trainer.choices["light"].value and "asked for by the recipe" in trainer.choices["light"].why
+    light = trainer.field.light
+    assert light is not None and all(p.grad is not None for p in light.parameters())
+
+
+def test_without_light_nothing_is_built(scene: Scene, tmp_path: Path) -> None:
+    field = fit(scene, tmp_path, recipe=SMALL.with_changes({"radiance.light": "off"}), steps=20)
+    assert field.light is None and not field.design.light and not any(name.startswith("light.") for name in field.state_dict())
+    assert field.manifest["needs"]["choices"]["light"]["value"] is False
+
+
+def test_a_field_that_decided_against_lamps_forgets_them(scene: Scene, tmp_path: Path) -> None:
+    """They must save more than everything: they cannot, and the run is that of a field without light."""
+    recipe = SMALL.with_changes({"radiance.light_min_improvement": 1.0})
+    field = fit(scene, tmp_path, recipe=recipe, steps=20)
+    choice = field.manifest["needs"]["choices"]["light"]
+    assert field.light is None and not choice["value"] and "100% asked for" in choice["why"]
+    assert load_field(tmp_path).light is None
+
+
+@pytest.mark.parametrize("stop", [10, 15, 30])  # before lamps are sought, in their trial, and after it
+@pytest.mark.parametrize("least", [0.0, 1.0])
+def test_a_fit_resumes_to_the_same_lamps(scene: Scene, stop: int, least: float) -> None:
+    recipe = SMALL.with_changes({"radiance.light_min_improvement": least})
+    first, second = (Trainer(scene, recipe, 40, None, 0, "cpu") for _ in range(2))
+    for step in range(36):
+        if step == stop:
+            saved = copy.deepcopy(first.checkpoint())
+        first.run_step()
+    second.restore(saved)
+    for _ in range(36 - stop):
+        second.run_step()
+    expected, found = first.field.state_dict(), second.field.state_dict()
+    assert list(expected) == list(found) and all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+def test_lamps_stand_beyond_the_cameras(scene: Scene) -> None:
+    trainer, sampling = _ready(scene)
+    count = look_for_lamps(trainer.field, trainer.measurements, sampling, 0)
+    light = trainer.field.light
+    assert light is not None and count == int(light.count) > 0
+    cameras = np.concatenate([np.linalg.norm(m.origins, axis=1) for m in trainer.measurements.values()])
+    assert float(light.position[:count].detach().norm(dim=1).min()) > float(np.median(cameras))
+
+
+def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
+    """A surface without strength: the lamps save nothing, exactly."""
+    trainer, sampling = _ready(scene)
+    light = trainer.field.light
+    assert light is not None
+    with torch.no_grad():
+        light.second.weight[1] = 0.0
+        light.second.bias[1] = -200.0
+    recipe = trainer.recipe.radiance.model_copy(update={"light": "auto", "light_min_improvement": 1e-6})
+    choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0)
+    assert not choice.value and "save 0.0%" in choice.why
