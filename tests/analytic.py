@@ -48,6 +48,8 @@ def meets_ball(points: np.ndarray, eye: np.ndarray, centre: np.ndarray, radius: 
 class AnalyticField:
     """Lambertian-like surface under a fixed light; polarization axis along the projected normal, DoLP 0.3."""
 
+    shines = False  # it mirrors no lamps
+
     def __init__(self, distance: Distance, sensors: Sequence[Sensor] = (RGB, MS, POL, MONO), region: Region | None = None) -> None:
         self.distance = distance
         self.region = region or Region((0.0, 0.0, 0.0), 1.0)

@@ -88,7 +88,9 @@ def generate_dataset(
     modalities: Annotated[str | None, typer.Option(help="default: all")] = None,
     outputs: Annotated[
         str | None,
-        typer.Option(help="in addition to the modalities: any of geometry,flow,coverage, or none; default: all", metavar="NAMES"),
+        typer.Option(
+            help="in addition to the modalities: any of geometry,flow,coverage,light, or none; default: all but light", metavar="NAMES"
+        ),
     ] = None,
     min_coverage: Annotated[
         float | None, typer.Option(help="leave out views whose mean coverage by the training frames is below this, 0 to 1")

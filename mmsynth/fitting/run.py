@@ -135,6 +135,7 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
         "recipe": trainer.recipe.model_dump(),
         "needs": asdict(replace(trainer.needs, choices=trainer.choices)),
         "exposure": trainer.gains(),
+        "lamps": _lamps(trainer),
         "poses": _poses(trainer, scene),
         "seed": trainer.seed,
         "steps": trainer.state.step,
@@ -150,6 +151,18 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
         "device": str(trainer.device),
         "conventions": CONVENTIONS,
     }
+
+
+def _lamps(trainer: Trainer) -> list[dict[str, Any]]:
+    """Of lamps that surfaces mirror: position in the scene's frame and unit, spectrum per modality, relative to full scale."""
+    field = trainer.field
+    if field.light is None or not field.shines:
+        return []
+    lamps = field.light.lamps()
+    places = lamps.position.detach().cpu().numpy() * field.region.radius + np.array(field.region.centre)
+    spectra = {n: lamps.spectrum[:, c].detach().cpu() * field.radiance_scale[n] for n, c in field.shader.columns.items()}
+    of = lambda name, k: spectra[name][k, :1] if field.sensors[name].is_polarization else spectra[name][k]
+    return [{"position": place.tolist(), "spectrum": {n: of(n, k).tolist() for n in spectra}} for k, place in enumerate(places)]
 
 
 def _poses(trainer: Trainer, scene: Scene) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Design, Field
 from mmsynth.field.kernels import intensity, radiance
 from mmsynth.field.light import Light
+from mmsynth.field.light_rendering import render_light
 from mmsynth.field.radiance import Shader
 from mmsynth.field.storage import load_field, save_field
 from mmsynth.scene.scene import Region, Sensor
@@ -246,3 +247,22 @@ def test_light_is_never_negative(raw: list[float], angle: float) -> None:
     crossed = torch.tensor([[-np.sin(angle), np.cos(angle), 0.0]], dtype=torch.float32)
     total = intensity(numbers, torch.eye(3)[:2]).sum()
     torch.testing.assert_close(intensity(numbers, axes[:1]).sum() + intensity(numbers, crossed).sum(), total, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_what_is_mirrored_and_the_rest_is_all_light(background: bool) -> None:
+    field = _field(background, Region((1.0, 2.0, 3.0), 0.5))
+    camera, pose = Camera(16, 12, 12.0, 12.0, 7.5, 5.5), np.eye(4)
+    pose[:3, 3] = 1.0, 2.0, 2.2
+    plain = field.render(camera, pose)
+    with pytest.raises(InputError, match="no lamps"):
+        render_light(field, camera, pose)
+    field.light = Light(field.appearance.width, field.shader.heads.out_features)
+    field.light.put(torch.tensor([[0.0, 0.0, -3.0], [2.0, 2.0, -1.0]]))
+    whole, light = field.render(camera, pose), render_light(field, camera, pose)
+    for name, mirrored in light.mirrored.items():
+        np.testing.assert_allclose(whole.channels[name], plain.channels[name] + mirrored, atol=1e-6, rtol=1e-5)
+        assert (mirrored > 1e-3).sum() > 20 and (mirrored >= 0).all()
+    hit = np.isfinite(light.roughness)
+    assert hit.sum() > 20 and np.array_equal(hit, np.isfinite(light.strength))
+    assert 0.02 < light.roughness[hit].min() <= light.roughness[hit].max() < 1.0 and light.strength[hit].min() > 0.0

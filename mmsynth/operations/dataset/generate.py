@@ -8,6 +8,7 @@ Layout of ``<out>``::
         rgb.npz ms.npz ...   one record per modality (see ``records``): data, stokes
         geometry.npz         depth_z, depth_ray, normal, normal_camera, opacity, mask (opacity > 0.5), valid, coverage (see ``coverage``),
                              saturated_rgb ... (where that sensor would have clipped)
+        light.npz            mirrored_rgb ..., the part of each modality that is images of lamps, roughness, strength; where it is asked for
         flow.npz             flow to the next view, occluded (see ``flow``); the last view has none
         image.png            16-bit linear picture of the first modality (for transforms.json and for looking)
         view.json            camera and pose per modality, the files and their hashes; written last: the view is complete
@@ -15,8 +16,8 @@ Layout of ``<out>``::
 
 As ``exr`` or ``tiff`` the records are of that type. ``webdataset`` packs 64 views at a time into shards/NNNNNN.tar, whose sidecar is
 written last, and removes their folders. ``mms-data`` puts the modalities into modalities/NAME/NNNN.tiff (16 bits, clipped to [0, 1]) with
-a meta_data.json, a scene that can be fitted. On the native rig every modality has a grid of its own: ``geometry_NAME``, ``flow_NAME``,
-``image_NAME`` and ``transforms_NAME.json`` instead.
+a meta_data.json, a scene that can be fitted. On the native rig every modality has a grid of its own: ``geometry_NAME``, ``light_NAME``,
+``flow_NAME``, ``image_NAME`` and ``transforms_NAME.json`` instead.
 
 A run that is interrupted goes on where it was: a view whose ``view.json`` belongs to the same request and whose files have the
 stated hashes is not rendered again. The same field and request give the same bytes, in one process or in many.
@@ -32,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.field.light_rendering import render_light
 from mmsynth.files import sha256_of, write_json
 from mmsynth.operations.dataset.index import PER_SHARD, finished_view, pack_shard, shard_name, view_folder
 from mmsynth.operations.dataset.plan import DatasetFormat, Plan, check_request, meta_of, plan_dataset
@@ -96,7 +98,8 @@ def generate_dataset(
         modalities: names or aliases; None: all of the field.
         rig: of what the views are, see ``Rig``; on the native rig, of the field's first sensor.
         file_format: "npz", "exr" (named float channels), "tiff" (16-bit images, float geometry), "webdataset" or "mms-data".
-        outputs: of "geometry", "flow" and "coverage", what is wanted beside the modalities; None: all of it, coverage with a scene only.
+        outputs: of "geometry", "flow", "coverage" and "light", what is wanted beside the modalities; None: all but light, coverage with a
+            scene only.
         min_coverage: leave out views that the training frames cover less, in [0, 1]; 1 = their own pixels (see ``coverage.view_score``).
         rays: of the training frames, where they were made already (``coverage.training_rays``); None: of the scene.
         sensors: files of those whose raw frames at these views go into raw/, a scene of its own (see ``simulate``, also for ``seed``).
@@ -205,6 +208,12 @@ def _write_view(plan: Plan, index: int, renderings: Sequence[Rendering], followi
                 hit = arrays["coverage"][np.isfinite(arrays["coverage"])]
                 scores.append(float(hit.mean(dtype=np.float64)) if hit.size else 0.0)
             files |= write_record(folder, _of("geometry", group[0], plan.rig), arrays, record_format, units=units)
+        if "light" in plan.outputs:
+            light = render_light(plan.field, at.camera, at.camera_to_world, group)
+            arrays = {f"mirrored_{name}": values for name, values in light.mirrored.items()}
+            arrays |= {"roughness": light.roughness, "strength": light.strength}
+            shares = UNITS | {f"mirrored_{name}": "full scale" for name in group}
+            files |= write_record(folder, _of("light", group[0], plan.rig), arrays, record_format, units=shares)
         if following is not None:
             there = plan.placed[index + 1][group[0]]
             flow, occluded = optical_flow(at, rendering.depth_ray, rendering.normal, there, following[number])

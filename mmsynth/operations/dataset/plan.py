@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 DatasetFormat = Literal[RecordFormat, "webdataset", "mms-data"]
 DATASET_FORMATS: tuple[DatasetFormat, ...] = get_args(DatasetFormat)
-OUTPUTS = ("geometry", "flow", "coverage")
+OUTPUTS = ("geometry", "flow", "coverage", "light")
 LAYOUT = 2
 
 Placed = dict[str, PosedCamera]  # of each modality at one view
@@ -82,7 +82,9 @@ def check_request(
     unknown = [o for o in outputs or () if o not in OUTPUTS]
     if unknown:
         raise InputError(f"dataset: output {unknown[0]!r}, expected some of {', '.join(OUTPUTS)}.")
-    return names, tuple(o for o in OUTPUTS if outputs is None or o in outputs)
+    if outputs is not None and "light" in outputs and not field.shines:
+        raise InputError("dataset: output 'light', but this field has no lamps that surfaces mirror (see `light` in the run's report).")
+    return names, tuple(o for o in OUTPUTS if (outputs is None and o != "light") or (outputs is not None and o in outputs))
 
 
 def plan_dataset(

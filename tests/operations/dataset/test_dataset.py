@@ -8,18 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import AnalyticField, ring_pose, scene_of, sphere
+import torch
+from analytic import POL, RGB, AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
+from mmsynth.field.field import Design, Field
 from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.dataset.index import verify_dataset
 from mmsynth.operations.dataset.plan import DATASET_FORMATS
+from mmsynth.operations.output.records import read_record
 from mmsynth.operations.output.work_partition import WorkPartition, partition_of_environment
 from mmsynth.operations.views.coverage import training_rays
 from mmsynth.operations.views.flow import optical_flow
 from mmsynth.scene.images import read_image
 from mmsynth.scene.load import read_poses
-from mmsynth.scene.scene import PosedCamera
+from mmsynth.scene.scene import PosedCamera, Region
+from mmsynth.sensors.camera import Camera
 
 
 def views_of(field: AnalyticField, count: int = 2) -> list[PosedCamera]:
@@ -231,6 +235,32 @@ def test_verify_finds_damage(tmp_path: Path) -> None:
         assert name in problem.replace("\\", "/")
 
 
+@pytest.mark.parametrize("file_format", ["npz", "exr", "tiff"])
+def test_light_is_a_record_of_its_own(tmp_path: Path, file_format: Any) -> None:
+    torch.manual_seed(0)
+    sizes: dict[str, Any] = {
+        "surface_rows_log2": 10,
+        "radiance_rows_log2": 10,
+        "surface_levels": 2,
+        "radiance_levels": 2,
+        "surface_hidden": 8,
+    }
+    field = Field(Design(light=True, **sizes), {s.name: s for s in (RGB, POL)}, {"rgb": 0.5, "pol": 0.2}, Region((0.0, 0.0, 0.0), 1.0))
+    assert field.light is not None
+    field.light.put(torch.tensor([[0.0, 1.0, 4.0], [3.0, 0.0, 2.0]]))
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 2.0
+    view = PosedCamera(Camera(24, 16, 20.0, 20.0, 11.5, 7.5), pose, "one")
+    made = generate_dataset(field, [view], tmp_path, file_format=file_format, outputs=["light"])
+    assert made.path is not None and verify_dataset(tmp_path) == []
+    files = json.loads((tmp_path / "views/0000/view.json").read_text())["files"]
+    light, rgb = (read_record(tmp_path / "views/0000", files, record) for record in ("light", "rgb"))
+    assert set(light) == {"mirrored_rgb", "mirrored_pol", "roughness", "strength"}
+    assert light["mirrored_rgb"].shape == (16, 24, 3) and light["mirrored_pol"].shape == (16, 24, 4)
+    assert light["mirrored_rgb"].max() > 0.01 and (rgb["data"] - light["mirrored_rgb"]).min() > -1e-4
+    assert not {name for name in files if name.startswith("geometry")}
+
+
 def test_refuses(tmp_path: Path) -> None:
     field = AnalyticField(sphere())
     views = views_of(field)
@@ -240,8 +270,9 @@ def test_refuses(tmp_path: Path) -> None:
         ({"file_format": "jpg"}, "npz, exr, tiff"),
         ({"modalities": ["thermal"]}, "'thermal'"),
         ({"modalities": []}, "no modalities"),
-        ({"outputs": ["masks"]}, "output 'masks', expected some of geometry, flow, coverage"),
+        ({"outputs": ["masks"]}, "output 'masks', expected some of geometry, flow, coverage, light"),
         ({"outputs": ["coverage"]}, "coverage needs the rays"),
+        ({"outputs": ["light"]}, "no lamps"),
     ]:
         with pytest.raises(InputError, match=message):
             generate_dataset(field, views, out, **arguments)  # type: ignore[arg-type]
