@@ -16,6 +16,7 @@ from mmsynth.field.kernels import Lamps, Reflection
 
 LAMPS = 6  # at the most
 _HIDDEN = 32
+_CHUNK = 64  # surfaces
 _START = (-1.0, -2.0, 2.0)  # roughness, strength and visibility before their functions: 0.28, 0.13, 0.88
 
 
@@ -48,12 +49,20 @@ class Light(nn.Module):
 
     def material(self, features: Tensor) -> Tensor:
         """What surfaces do with the lamps, (H, F) → (H, 2 + K): see ``kernels.mirroring.material``."""
-        return self.second(torch.relu(self.first(features)))[:, : 2 + int(self.count)]
+        rows = len(features)
+        # products of a fixed size: sums do not depend on the number of threads
+        chunks = nn.functional.pad(features, (0, 0, 0, -rows % _CHUNK)).view(-1, _CHUNK, features.shape[1])
+        hidden = torch.relu(_layer(chunks, self.first))
+        return _layer(hidden, self.second).reshape(-1, self.second.out_features)[:rows, : 2 + int(self.count)]
 
     def lamps(self) -> Lamps:
         """What the kernels take."""
         count = int(self.count)
         return Lamps(self.position[:count], torch.exp(self.log_spectrum[:count]))
+
+
+def _layer(chunks: Tensor, layer: nn.Linear) -> Tensor:
+    return torch.baddbmm(layer.bias[None, None], chunks, layer.weight.T.expand(len(chunks), -1, -1))
 
 
 def stokes(reflection: Reflection, spectrum: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from mmsynth.fitting.recipe import RadianceRecipe
 _RAYS = 4096  # per modality
 _STEPS = 40
 _RATE = 4e-3
+_SURE = 2.0  # standard errors of what lamps save
 _FARTHER = 2.0  # than the cameras: where lamps are looked for first
 _BRIGHTEST = 3.0  # times the typical value: what is brighter does not say more
 
@@ -87,19 +88,20 @@ def decide_light(
     look = _look(field, measurements, sampling, seed)
     batch = look.batch
     mirrored = field.mirrored(look.hits, batch.origins, batch.directions, batch.measured, sampling.active_surface).detach()
-    lit, unlit = (_error(field.shader, look, light) for light in (mirrored, torch.zeros_like(mirrored)))
-    saved = 1.0 - lit / unlit if unlit > 0 else 0.0
+    lit, unlit = (_errors(field.shader, look, light) for light in (mirrored, torch.zeros_like(mirrored)))
+    whole = float(unlit.mean())
+    saved, unsure = (0.0, 0.0) if whole == 0 else (1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole)
     count = 0 if field.light is None else int(field.light.count)
-    why = f"{count} lamps, mirrored, save {saved:.1%} of the error of rays not learned from"
+    why = f"{count} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of the error of rays not learned from"
     if recipe.light == "on":
         return switch(True, f"asked for by the recipe; {why}")
-    worth = recipe.light_min_improvement
-    return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.0%} asked for")
+    worth = max(recipe.light_min_improvement, _SURE * unsure)
+    return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.1%} asked for")
 
 
-def _error(shader: Shader, look: _Look, mirrored: Tensor) -> float:
-    """Mean over modalities of the squared error at rays of odd number, relative to the modality's level, after a copy of the shader has
-    learned from the others, beside mirrored light (M,)."""
+def _errors(shader: Shader, look: _Look, mirrored: Tensor) -> Tensor:
+    """Squared errors of numbers at rays of odd number, relative to the modality's level, after a copy of the shader has learned from the
+    others, beside mirrored light (M,)."""
     m, hits = look.batch.measured, look.hits
     learned, usable = m.ray % 2 == 0, m.target < m.saturation
     candidate = copy.deepcopy(shader)
@@ -111,6 +113,4 @@ def _error(shader: Shader, look: _Look, mirrored: Tensor) -> float:
         if step < _STEPS:
             kernels.photometric(difference * learned, m).backward()
             optimiser.step(1.0 - step / _STEPS)
-    relative = (difference / m.level).detach().square()
-    errors = [relative[numbers][(~learned & usable)[numbers]].mean() for _, numbers in look.batch.parts.values()]
-    return float(torch.stack(errors).nanmean())
+    return (difference / m.level).detach().square()[~learned & usable]

@@ -62,7 +62,7 @@ def test_bench_ablation(tmp_path: Path) -> None:
 def test_bench_kernels(tmp_path: Path) -> None:
     result = call("bench", "kernels", "--samples", "256", "--threads", "1", "--json")
     assert result.exit_code == 0, result.output
-    assert {row["operation"] for row in json.loads(result.stdout)["rows"]} == {"surface_value", "trace", "compare", "adam"}
+    assert {row["operation"] for row in json.loads(result.stdout)["rows"]} == {"surface_value", "trace", "compare", "mirror", "adam"}
     assert (tmp_path / "bench" / "kernels" / "plot.svg").is_file()
 
 

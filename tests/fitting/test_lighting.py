@@ -67,7 +67,7 @@ def test_a_field_that_decided_against_lamps_forgets_them(scene: Scene, tmp_path:
     recipe = SMALL.with_changes({"radiance.light_min_improvement": 1.0})
     field = fit(scene, tmp_path, recipe=recipe, steps=20)
     choice = field.manifest["needs"]["choices"]["light"]
-    assert field.light is None and not choice["value"] and "100% asked for" in choice["why"]
+    assert field.light is None and not choice["value"] and "100.0% asked for" in choice["why"]
     assert load_field(tmp_path).light is None
 
 

@@ -27,7 +27,8 @@ SMALL: dict[str, Any] = {
     "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 4, "loss.eikonal_points": 64, "radiance.hidden_width": 32,
     "surface.max_rows_log2": 16, "radiance.max_rows_log2": 17, "radiance.cells_per_pixel": 30.0, "surface.cells_per_row": 2.0,
     "radiance.cells_per_row": 2.0, "surface.rays_per_row": 0.002, "radiance.rays_per_row": 1e-3, "schedule.tables_at": 0.125,
-    "schedule.levels_until": 0.5, "poses.views": "off", "poses.rig": "off", "schedule.ema_fraction": 0.25, "radiance.view_dependence": 1,
+    "schedule.levels_until": 0.5, "poses.views": "off", "poses.rig": "off", "radiance.light": "off",
+    "schedule.ema_fraction": 0.25, "radiance.view_dependence": 1,
     "radiance.exposure": "off",
 }  # fmt: skip
 
