@@ -48,10 +48,14 @@ def meets_ball(points: np.ndarray, eye: np.ndarray, centre: np.ndarray, radius: 
 class AnalyticField:
     """Lambertian-like surface under a fixed light; polarization axis along the projected normal, DoLP 0.3."""
 
-    shines = False  # it mirrors no lamps
-
-    def __init__(self, distance: Distance, sensors: Sequence[Sensor] = (RGB, MS, POL, MONO), region: Region | None = None) -> None:
-        self.distance = distance
+    def __init__(
+        self,
+        distance: Distance,
+        sensors: Sequence[Sensor] = (RGB, MS, POL, MONO),
+        region: Region | None = None,
+        mirrored: float = 0.0,
+    ) -> None:
+        self.distance, self.mirrored = distance, mirrored
         self.region = region or Region((0.0, 0.0, 0.0), 1.0)
         self.unit = "m"
         self.manifest: dict[str, Any] = {}
@@ -81,8 +85,14 @@ class AnalyticField:
         slope = np.stack([self.distance(p + e) - self.distance(p - e) for e in step], -1)
         return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
 
-    def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
-        """Rays of one camera, as ``Field.cast``."""
+    @property
+    def shines(self) -> bool:
+        return self.mirrored > 0
+
+    def cast(
+        self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool, light: bool = False
+    ) -> dict[str, np.ndarray]:
+        """Rays of one camera, as ``Field.cast``; with ``light``, a white lamp's image is ``mirrored`` of the shade."""
         direction, origin = directions @ camera_to_world[:3, :3].T, camera_to_world[:3, 3]
         t = np.zeros(len(directions))
         for _ in range(100):
@@ -90,8 +100,8 @@ class AnalyticField:
         point = origin + direction * t[:, None]
         hit = (np.abs(self.distance(point)) < 1e-4) & (t > 0)
         normal = self.normal(point)
-        light = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
-        shade = np.where(hit, 0.15 + 0.6 * np.clip(normal @ light, 0, None), 0.05)
+        sun = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
+        shade = np.where(hit, 0.15 + 0.6 * np.clip(normal @ sun, 0, None), 0.05)
         out = {"opacity": hit, "depth": np.where(hit, t / self.region.radius, np.nan), "normal": np.where(hit[:, None], normal, np.nan)}
         for name in modalities:
             sensor = self.sensors[name]
@@ -102,6 +112,12 @@ class AnalyticField:
                 s = np.stack([shade, shade * dolp * np.cos(2 * phi), shade * dolp * np.sin(2 * phi)], -1)
                 out[f"stokes/{name}"] = s
                 out[name] = stokes_to_intensities(torch.from_numpy(s), sensor.polarizer_angles_deg).numpy()
+                if light:
+                    out[f"mirrored_s0/{name}"] = self.mirrored * shade
+            if light:
+                out[f"mirrored/{name}"] = np.repeat(self.mirrored * shade[:, None], sensor.channel_count, 1)
+        if light:
+            out |= {"roughness": np.where(hit, 0.25, np.nan), "strength": np.where(hit, 2.0, np.nan)}
         return {key: value.astype(np.float32) for key, value in out.items()}
 
     def render(

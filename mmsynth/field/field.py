@@ -15,6 +15,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
+from mmsynth.field.kernels.mirroring import material
 from mmsynth.field.light import Light, stokes
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
@@ -192,19 +193,28 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def render_rays(
-        self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
+        self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool, light: bool = False
     ) -> dict[str, Tensor]:
         """Rays of the normalised frame, R of them → per modality (R, C), ``stokes/<name>`` (R, 3), opacity, depth.
 
-        With ``geometry`` also normal: that takes four more samples a ray, depth comes with the light.
+        With ``geometry`` also normal: that takes four more samples a ray, depth comes with the light. With ``light``, of a field whose
+        surfaces mirror lamps, also ``mirrored/<name>`` (R, C), the images of lamps in each modality, and roughness and strength (R,): means
+        over the surfaces met, NaN where less than half of a ray meets any. Of a polarization modality ``mirrored_s0/<name>`` (R,), too.
         """
         jitter = torch.full((len(origins),), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
-        return self.shade_hits(hits, origins, directions, camera_x, modalities, geometry)
+        return self.shade_hits(hits, origins, directions, camera_x, modalities, geometry, light)
 
     @torch.no_grad()
     def shade_hits(
-        self, hits: rendering.Hits, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool
+        self,
+        hits: rendering.Hits,
+        origins: Tensor,
+        directions: Tensor,
+        camera_x: Tensor,
+        modalities: Sequence[str],
+        geometry: bool,
+        light: bool = False,
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
         shaded, rays = self.with_far_light(hits), len(directions)
@@ -214,9 +224,9 @@ class Field(nn.Module):
         images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
         outputs = {d: self.shader(shaded.features, directions[ray], d) for d in {self.view_dependence[n] for n in modalities}}
 
-        def together(light: Tensor, share: Tensor) -> Tensor:
+        def together(values: Tensor, share: Tensor) -> Tensor:
             """Of the surfaces that a ray meets, (H, C) → (R, C)."""
-            seen = share[:, None] * light
+            seen = share[:, None] * values
             return seen[:rays].index_add(0, ray[rays:], seen[rays:])
 
         # a background is opaque, too, but what lies there is not the object
@@ -230,15 +240,26 @@ class Field(nn.Module):
             if angles is None:
                 out[name] = together(self.shader.values(name, raw), shaded.share)
                 if lamps is not None and images is not None:
-                    out[name] += scale * together(images.amount @ lamps.spectrum[:, self.shader.columns[name]], hits.share)
+                    mirrored = scale * together(images.amount @ lamps.spectrum[:, self.shader.columns[name]], hits.share)
+                    out[name] += mirrored
+                    if light:
+                        out[f"mirrored/{name}"] = mirrored
                 continue
             x, y = (axis[ray] for axis in reference_axes(directions, camera_x))
             behind, vectors = self.shader.polarized(name, raw, x, y, torch.deg2rad(torch.tensor(angles, device=origins.device)))
             out[name], out[f"stokes/{name}"] = together(behind, shaded.share), together(vectors, shaded.share)
             if lamps is not None and images is not None:
                 more = scale * together(stokes(images, lamps.spectrum[:, self.shader.columns[name].start], x, y), hits.share)
+                mirrored = stokes_to_intensities(more, angles)
                 out[f"stokes/{name}"] += more
-                out[name] += stokes_to_intensities(more, angles)
+                out[name] += mirrored
+                if light:
+                    out[f"mirrored/{name}"], out[f"mirrored_s0/{name}"] = mirrored, more[:, 0]
+        if light and mirrors is not None:
+            roughness, strength, _ = material(mirrors.material)
+            met = torch.where(hits.opacity > 0.5, hits.opacity, torch.full_like(hits.opacity, float("nan")))
+            for key, value in (("roughness", roughness), ("strength", strength)):
+                out[key] = together(value[:, None], hits.share)[:, 0] / met
         if geometry:
             # of the surface at which half of the light is met
             nearest = torch.where((hits.share[:rays] >= 0.5) | (hits.behind < 0), ray[:rays], hits.behind)
@@ -280,9 +301,12 @@ class Field(nn.Module):
         mirrors, _ = self.mirrors(hits, origins, directions, active)
         return kernels.mirror(self.light.lamps(), mirrors, hits.behind, measured) * measured.level
 
-    def cast(self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool) -> dict[str, np.ndarray]:
+    def cast(
+        self, directions: np.ndarray, camera_to_world: np.ndarray, modalities: Sequence[str], geometry: bool, light: bool = False
+    ) -> dict[str, np.ndarray]:
         """``render_rays`` of rays of one camera: directions (R, 3) in its axes, scene frame; depth stays in radii."""
-        return {k: x.cpu().numpy() for k, x in self.render_rays(*self.rays_of(directions, camera_to_world), modalities, geometry).items()}
+        found = self.render_rays(*self.rays_of(directions, camera_to_world), modalities, geometry, light)
+        return {key: value.cpu().numpy() for key, value in found.items()}
 
     def rays_of(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""

@@ -16,14 +16,17 @@ Attributes, float32, NaN where no ray reached the vertex:
   ``<modality>_axis_x, _y, _z``: the axis along which it swings, a unit vector in world space (its sign has no meaning), the first
   eigenvector of T = Σ p S0 e eᵀ. Angles are never averaged. ``<modality>_axis_share``: λ₁ / tr T, 1 where all rays agree on the axis,
   1/3 where it is anywhere. Each ray's polarization is perpendicular to it, so axes of different views differ a little by necessity.
+* where surfaces mirror lamps: ``<modality>_base_<i>`` (``<modality>_base_s0``), the same light without the lamps' images, which stay where
+  they are when the viewer moves no more than other paint does; ``roughness``, α of GGX, and ``strength``, the height of a highlight in
+  units of the lamp (see ``field.kernels.mirroring``).
 * ``views``: how many training views see the vertex. ``spread``: standard deviation of the rays' light (the mean over modalities of
   their mean channel, S0 of polarization) over its mean: large where the surface shines, or is in the wrong place.
 * ``confidence`` in [0, 1]: views / (views + 8) · 1 / (1 + spread / 4) · 1 / (1 + residual / 0.1), with the residual |f| / cell at the
   vertex; 0 where no view sees it. It orders vertices and is no probability: in that room, the median distance to the true surface fell with
   it, most of that by the number of views.
 
-``visual.vertex_colors`` is a preview: the first modality whose channels make colours (rgb, else the first of all), tone-mapped, grey 128
-where nothing was seen.
+``visual.vertex_colors`` is a preview: the first modality whose channels make colours (rgb, else the first of all), tone-mapped, without
+the lamps' images where these are known, grey 128 where nothing was seen.
 """
 
 from __future__ import annotations
@@ -124,13 +127,15 @@ def views_that_see(views: Sequence[View], points: np.ndarray, normals: np.ndarra
 
 
 class _Sums:
-    """Of the rays of each vertex: light, polarization, and how much it varies."""
+    """Of the rays of each vertex: light, the lamps' images in it, polarization, and how much it varies."""
 
-    def __init__(self, count: int, sensors: Sequence[Sensor]) -> None:
+    def __init__(self, count: int, sensors: Sequence[Sensor], shines: bool) -> None:
         self.rays = np.zeros(count)
         self.light = {s.name: np.zeros((count, 1 if s.is_polarization else s.channel_count)) for s in sensors}
         self.axes = {s.name: np.zeros((count, 3, 3)) for s in sensors if s.is_polarization}
         self.brightness = np.zeros((count, 2))
+        self.mirrored = {name: np.zeros_like(light) for name, light in self.light.items()} if shines else {}
+        self.material = np.zeros((count, 2))  # roughness, strength
 
     def add(self, rows: np.ndarray, cast: dict[str, np.ndarray], directions: np.ndarray, camera_x: np.ndarray) -> None:
         """Rays to vertices ``rows`` (N,), each at most once; directions (N, 3) world."""
@@ -144,6 +149,10 @@ class _Sums:
             else:
                 sums[rows] += cast[name]
                 brightness += cast[name].mean(1)
+        for name, sums in self.mirrored.items():
+            sums[rows] += cast[f"mirrored_s0/{name}"][:, None] if name in self.axes else cast[f"mirrored/{name}"]
+        if self.mirrored:
+            self.material[rows] += np.stack([cast["roughness"], cast["strength"]], 1)
         brightness /= len(self.light)
         self.rays[rows] += 1.0
         self.brightness[rows] += np.stack([brightness, brightness**2], 1)
@@ -178,7 +187,7 @@ def add_attributes(mesh: trimesh.Trimesh, field: Field, scene: Scene, cell: floa
         count(len(points[part]))
     values = {key: np.concatenate([part[key] for part in found]).astype(np.float32) for key in found[0]}
     mesh.vertex_attributes.update(values)
-    mesh.metadata["properties"] = _described(sensors)
+    mesh.metadata["properties"] = _described(sensors, field.shines)
     visual: Any = mesh.visual
     visual.vertex_colors = _preview(sensors, values)
 
@@ -187,7 +196,7 @@ def _of_part(
     field: Field, sensors: Sequence[Sensor], views: Sequence[View], points: np.ndarray, normals: np.ndarray, cell: float, rays: int
 ) -> dict[str, np.ndarray]:
     cosines = views_that_see(views, points, normals)
-    sums = _Sums(len(points), sensors)
+    sums = _Sums(len(points), sensors, field.shines)
     asked = _evenly(cosines, rays)
     for i, view in enumerate(views):
         rows = np.flatnonzero(asked[i])
@@ -195,7 +204,7 @@ def _of_part(
         away = points[rows] - pose[:3, 3]
         distance = np.linalg.norm(away, axis=1)
         directions = away / distance[:, None]
-        cast = field.cast(directions @ pose[:3, :3], pose, [s.name for s in sensors], geometry=True)
+        cast = field.cast(directions @ pose[:3, :3], pose, [s.name for s in sensors], geometry=False, light=field.shines)
         met = np.abs(cast["depth"] * field.region.radius - distance) <= _AGREES * distance  # NaN (no hit) is not
         sums.add(rows[met], {key: value[met] for key, value in cast.items()}, directions[met], pose[:3, 0])
     return _means(sums, sensors, (cosines > 0).sum(0), np.abs(field.sdf(points)) / cell)
@@ -222,6 +231,10 @@ def _means(sums: _Sums, sensors: Sequence[Sensor], views: np.ndarray, residual: 
     out: dict[str, np.ndarray] = {}
     for sensor in sensors:
         light = sums.light[sensor.name]
+        if sensor.name in sums.mirrored:
+            base = light - sums.mirrored[sensor.name]
+            keys = ["s0"] if sensor.is_polarization else range(sensor.channel_count)
+            out |= {f"{sensor.name}_base_{key}": base[:, i] / rays for i, key in enumerate(keys)}
         if not sensor.is_polarization:
             out |= {f"{sensor.name}_{i}": light[:, i] / rays for i in range(sensor.channel_count)}
             continue
@@ -233,6 +246,8 @@ def _means(sums: _Sums, sensors: Sequence[Sensor], views: np.ndarray, residual: 
         out[f"{sensor.name}_dolp"] = np.divide(total, light[:, 0], out=np.full(len(rays), np.nan), where=reached & (light[:, 0] > 0))
         out |= {f"{sensor.name}_axis_{c}": axis[:, i] for i, c in enumerate("xyz")}
         out[f"{sensor.name}_axis_share"] = np.divide(strengths[:, -1], total, out=np.full(len(rays), np.nan), where=swings)
+    if sums.mirrored:
+        out["roughness"], out["strength"] = (sums.material / rays[:, None]).T
     mean, square = (sums.brightness / rays[:, None]).T
     # the difference of two nearly equal numbers may round to less than nothing
     variance = np.maximum(square - mean**2, 0.0)
@@ -243,11 +258,13 @@ def _means(sums: _Sums, sensors: Sequence[Sensor], views: np.ndarray, residual: 
     return out
 
 
-def _described(sensors: Sequence[Sensor]) -> dict[str, str]:
+def _described(sensors: Sequence[Sensor], shines: bool) -> dict[str, str]:
     """Property → what it is: channel and wavelength."""
     out: dict[str, str] = {}
     for sensor in sensors:
         if sensor.is_polarization:
+            if shines:
+                out[f"{sensor.name}_base_s0"] = "S0 without the images of lamps, linear, 1 = full scale"
             out[f"{sensor.name}_s0"] = "S0, linear, 1 = full scale"
             out[f"{sensor.name}_dolp"] = "degree of linear polarization"
             out |= {f"{sensor.name}_axis_{c}": f"axis of polarization, {c}, world frame, sign free" for c in "xyz"}
@@ -256,6 +273,10 @@ def _described(sensors: Sequence[Sensor]) -> dict[str, str]:
         for i, (label, wave) in enumerate(zip(sensor.channels, sensor.wavelengths_nm, strict=True)):
             at = "" if wave is None else f", wavelength_nm {wave:g}"
             out[f"{sensor.name}_{i}"] = f"channel {label}{at}, linear, 1 = full scale"
+            if shines:
+                out[f"{sensor.name}_base_{i}"] = f"channel {label}{at}, without the images of lamps, linear, 1 = full scale"
+    if shines:
+        out |= {"roughness": "roughness of the mirror, alpha of GGX, 0 to 1", "strength": "height of a highlight in units of the lamp"}
     return out | {
         "views": "training views that see the vertex",
         "spread": "deviation of the light between rays over its mean",
@@ -268,7 +289,8 @@ def _preview(sensors: Sequence[Sensor], values: dict[str, np.ndarray]) -> np.nda
     plain = [s for s in sensors if not s.is_polarization]
     chosen = next((s for s in plain if s.channel_count > 1), plain[0] if plain else None)
     if chosen is not None:
-        channels = np.stack([values[f"{chosen.name}_{i}"] for i in range(chosen.channel_count)], -1)
+        base = f"{chosen.name}_base" if f"{chosen.name}_base_0" in values else chosen.name
+        channels = np.stack([values[f"{base}_{i}"] for i in range(chosen.channel_count)], -1)
         linear = previews.preview_linear(chosen, channels)
     else:
         linear = np.repeat(values[f"{sensors[0].name}_s0"][:, None], 3, 1)

@@ -6,12 +6,14 @@
   them by more than a thousandth of an edge. The confidence is called ``quality``, which MeshLab reads (it reads a float ``confidence``
   wrongly, and no names but its own).
 * GLB: the same as attributes ``_MS_3`` beside POSITION, NORMAL and COLOR_0. glTF has no NaN: what is not seen is 0 there, and ``_VIEWS`` 0
-  says so. glTF's own unit is the metre and its up is y; ours stay what they are and stand in the node's extras.
+  says so. glTF's own unit is the metre and its up is y; ours stay what they are and stand in the node's extras. Where surfaces mirror
+  lamps, COLOR_0 is the base colour, and the material has the median roughness (glTF's is √α); of each vertex it is in ``_ROUGHNESS``.
 * OBJ, STL: geometry only.
 """
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -113,4 +115,13 @@ def _glb(mesh: trimesh.Trimesh, unit: str) -> bytes:
     normals, colours = mesh.vertex_normals, colours_of(mesh)
     plain: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, None, normals, None, colours, process=False, metadata=extras)
     plain.vertex_attributes.update(attributes)
-    return bytes(plain.export(file_type="glb", include_normals=True))
+    return bytes(plain.export(file_type="glb", include_normals=True, tree_postprocessor=functools.partial(_add_material, mesh)))
+
+
+def _add_material(mesh: trimesh.Trimesh, tree: dict[str, Any]) -> None:
+    """A dielectric of one roughness, in glTF's tree, where vertices have one each."""
+    roughness = np.asarray(mesh.vertex_attributes.get("roughness", []), np.float32)
+    if np.isfinite(roughness).any():
+        factor = float(np.sqrt(np.nanmedian(roughness)))
+        tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": factor}}]
+        tree["meshes"][0]["primitives"][0]["material"] = 0

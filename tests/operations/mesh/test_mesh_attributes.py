@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from mmsynth.errors import InputError
 from mmsynth.operations.mesh.attributes import View, add_attributes, coarse, depth_maps, polarized_part, training_views, views_that_see
 from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
+from mmsynth.operations.mesh.files import write_mesh
 from mmsynth.scene.scene import PosedCamera, Scene, Split
 from mmsynth.sensors.camera import Camera, project, ray_map
 from mmsynth.sensors.polarization import stokes_to_coherency
@@ -61,6 +62,26 @@ def test_every_channel_is_there_and_right(baked: tuple[trimesh.Trimesh, Analytic
             assert np.abs(values[f"{sensor.name}_{i}"] - truth * gain)[seen].max() < 0.02
     assert np.abs(values["pol_s0"] - truth)[seen].max() < 0.02
     assert all(value.dtype == np.float32 and len(value) == len(mesh.vertices) for value in values.values())
+
+
+def test_where_surfaces_mirror_vertices_have_a_base_colour_and_a_roughness(tmp_path: Path) -> None:
+    """A quarter of the light in every channel is a lamp's image. glTF's material has the roughness; its colours are without the image."""
+    made = {}
+    for mirrored in (0.0, 0.25):
+        field = AnalyticField(sphere(0.6), (RGB, POL), mirrored=mirrored)
+        scene = scene_of(field, tmp_path / f"{mirrored}", views=5)
+        made[mirrored] = extract_mesh(field, MeshOptions(24), scene=scene)  # type: ignore[arg-type]
+    values, more = made[0.25].vertex_attributes, {"roughness", "strength", "pol_base_s0", *(f"rgb_base_{i}" for i in range(3))}
+    assert set(values) - set(made[0.0].vertex_attributes) == more and set(made[0.25].metadata["properties"]) == set(values)
+    seen = values["confidence"] > 0
+    for base, whole, rest in (("rgb_base_1", "rgb_1", 0.5 / 0.75), ("pol_base_s0", "pol_s0", 0.75)):
+        assert values[base][seen] == pytest.approx(rest * values[whole][seen], rel=1e-4) and np.isnan(values[base][~seen]).all()
+    assert values["roughness"][seen] == pytest.approx(0.25) and values["strength"][seen] == pytest.approx(2.0)
+    plain, base = (np.asarray(made[m].visual.vertex_colors)[seen, :3].astype(int) for m in (0.0, 0.25))  # type: ignore[attr-defined]
+    assert (base[:, 2] / base[:, 0] < plain[:, 2] / plain[:, 0] - 0.05).all()  # what is left has more of the paint's colour
+    write_mesh(made[0.25], tmp_path / "mesh.glb")
+    material = trimesh.load_mesh(tmp_path / "mesh.glb").visual.material
+    assert (material.roughnessFactor, material.metallicFactor) == (pytest.approx(0.5), 0.0)
 
 
 def test_what_nobody_sees_is_not_a_number_and_grey(baked: tuple[trimesh.Trimesh, AnalyticField, Scene]) -> None:
