@@ -276,7 +276,7 @@ class Field(nn.Module):
     @property
     def shines(self) -> bool:
         """Whether there are lamps whose light surfaces mirror."""
-        return self.light is not None and int(self.light.count) > 0
+        return self.light is not None and self.light.count > 0
 
     def mirrors(self, hits: rendering.Hits, origins: Tensor, directions: Tensor, active: int) -> tuple[kernels.Mirrors, Tensor]:
         """The surfaces that rays met as mirrors of the field's lamps, and ∇sdf there in the frame of the grid, (H, 3).

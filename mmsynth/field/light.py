@@ -27,10 +27,10 @@ class Light(nn.Module):
         features: of a surface. outputs: of the shader, each with the lamps' light in it (the first of six of a polarization).
     Attributes:
         position: (LAMPS, 3), normalised frame. log_spectrum: (LAMPS, outputs), relative to each modality's typical value.
-        count: () int64, how many lamps there are; the others are not used.
+        used: (LAMPS,) bool, which of them there are.
     """
 
-    count: Tensor
+    used: Tensor
 
     def __init__(self, features: int, outputs: int) -> None:
         super().__init__()
@@ -39,13 +39,18 @@ class Light(nn.Module):
             self.second.bias.copy_(torch.tensor([*_START[:2], *[_START[2]] * LAMPS]))
         self.position = nn.Parameter(torch.zeros(LAMPS, 3))
         self.log_spectrum = nn.Parameter(torch.zeros(LAMPS, outputs))
-        self.register_buffer("count", torch.tensor(0))
+        self.register_buffer("used", torch.zeros(LAMPS, dtype=torch.bool))
+
+    @property
+    def count(self) -> int:
+        """How many lamps there are, K."""
+        return int(self.used.sum())
 
     def put(self, positions: Tensor) -> None:
         """Lamps as bright as the scene, at (K, 3)."""
         with torch.no_grad():
             self.position[: len(positions)] = positions
-            self.count.fill_(len(positions))
+            self.used.copy_(torch.arange(LAMPS) < len(positions))
 
     def material(self, features: Tensor) -> Tensor:
         """What surfaces do with the lamps, (H, F) → (H, 2 + K): see ``kernels.mirroring.material``."""
@@ -53,12 +58,15 @@ class Light(nn.Module):
         # products of a fixed size: sums do not depend on the number of threads
         chunks = nn.functional.pad(features, (0, 0, 0, -rows % _CHUNK)).view(-1, _CHUNK, features.shape[1])
         hidden = torch.relu(_layer(chunks, self.first))
-        return _layer(hidden, self.second).reshape(-1, self.second.out_features)[:rows, : 2 + int(self.count)]
+        return _layer(hidden, self.second).reshape(-1, self.second.out_features)[:rows, self._columns()]
+
+    def _columns(self) -> Tensor:
+        """Of the last layer: roughness, strength, and the visibility of the lamps that there are."""
+        return torch.cat([torch.arange(2, device=self.used.device), 2 + torch.nonzero(self.used)[:, 0]])
 
     def lamps(self) -> Lamps:
         """What the kernels take."""
-        count = int(self.count)
-        return Lamps(self.position[:count], torch.exp(self.log_spectrum[:count]))
+        return Lamps(self.position[self.used], torch.exp(self.log_spectrum[self.used]))
 
 
 def _layer(chunks: Tensor, layer: nn.Linear) -> Tensor:

@@ -1,31 +1,27 @@
 """Two questions that residuals answer during a fit: how far radiance depends on direction, and whether exposures differ between frames.
 
-Rays of all frames are compared with what was measured. Half of them may be learned from, the other half judges.
+Rays of all frames are compared with what was measured: see ``candidates``.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from mmsynth.field import kernels, rendering
+from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
+from mmsynth.fitting.candidates import Look, look, squared_errors
 from mmsynth.fitting.choices import Choice, switch
-from mmsynth.fitting.measurements import Batch, Measurements, draw
-from mmsynth.fitting.optimiser import Adam
+from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import RadianceRecipe
 
 DEGREES = 3  # of spherical harmonics
-_RAYS = 2048  # per modality
-_STEPS = 40
-_RATE = 4e-3
+_RAYS = 2048  # per modality, to judge, and half as many to learn from
 
 
 @dataclass(frozen=True)
@@ -40,24 +36,17 @@ class Decisions:
         return {**{f"view_dependence.{name}": choice for name, choice in self.view_dependence.items()}, "exposure": self.exposure}
 
 
-@torch.no_grad()
 def decide(field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
     """Put the residuals of a field as it is to the tests of this module."""
     random = np.random.default_rng((seed, 2))
-    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random, field.device)
-    jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
-    hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-    ray = kernels.rays_of(hits.behind)
-    outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
-    mirrored = field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface)
-    predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind) + mirrored
+    learned, judged = (look(field, measurements, rays, sampling, random) for rays in (_RAYS // 2, _RAYS))
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, hits, batch, mirrored)
-        degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in batch.parts}
+        errors = errors_by_degree(field.shader, learned, judged)
+        degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in measurements}
     else:
         asked = recipe.view_dependence
-        degrees = dict.fromkeys(batch.parts, Choice(asked, f"degree {asked}: asked for by the recipe", asked > 0))
-    return Decisions(degrees, _exposure(predicted, batch, measurements, recipe))
+        degrees = dict.fromkeys(measurements, Choice(asked, f"degree {asked}: asked for by the recipe", asked > 0))
+    return Decisions(degrees, _exposure(field, judged, measurements, recipe))
 
 
 def _degree(errors: list[float], worth: float) -> Choice[int]:
@@ -66,11 +55,15 @@ def _degree(errors: list[float], worth: float) -> Choice[int]:
     return Choice(degree, f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}", degree > 0)
 
 
-def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measurements], recipe: RadianceRecipe) -> Choice[bool]:
+@torch.no_grad()
+def _exposure(field: Field, judged: Look, measurements: dict[str, Measurements], recipe: RadianceRecipe) -> Choice[bool]:
+    batch, hits = judged.batch, judged.hits
+    ray = kernels.rays_of(hits.behind)
+    outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
+    predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind) + judged.mirrored
     spreads = {}
-    usable = batch.measured.target < batch.measured.saturation
     for name, (_, own) in batch.parts.items():
-        m, kept = measurements[name], usable[own]
+        m, kept = measurements[name], judged.usable[own]
         of_modality = predicted[own][kept] / m.radiance_scale, batch.measured.target[own][kept] / m.radiance_scale, batch.frame[own][kept]
         spread, noise = exposure_spread(*(x.cpu().numpy() for x in of_modality))
         spreads[name] = spread if spread > 2 * noise / math.sqrt(len(m.origins)) else 0.0
@@ -80,38 +73,15 @@ def _exposure(predicted: Tensor, batch: Batch, measurements: dict[str, Measureme
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
-def errors_by_degree(shader: Shader, hits: kernels.Hits, batch: Batch, mirrored: Tensor) -> dict[str, list[float]]:
+def errors_by_degree(shader: Shader, learned: Look, judged: Look) -> dict[str, list[float]]:
     """Mean squared error of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
 
-    Copies of the shader, one per degree, go on learning for some steps from the rays of even number, geometry and appearance
-    held fixed: one that can do without directions has learned to by then. (Asking only what the shader loses when directions are
-    taken from it would not tell: it uses what it is given, needed or not.)
-
-    Args:
-        hits: of the R rays. batch: these rays, and what was measured along them. mirrored: (M,) light that is not the shader's.
     Returns:
         by modality; NaN where every number is clipped.
     """
-    learned, directions = batch.measured.ray % 2 == 0, batch.directions[kernels.rays_of(hits.behind)]
-    usable = batch.measured.target < batch.measured.saturation
-    out: dict[str, list[float]] = {name: [] for name in batch.parts}
-    for degree in range(DEGREES + 1):
-        candidate = copy.deepcopy(shader)
-        parameters = dict(candidate.named_parameters())
-        optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
-        for step in range(_STEPS + 1):
-            with torch.enable_grad():
-                predicted = (
-                    kernels.predict(candidate(hits.features, directions, degree), hits.share, batch.measured, hits.behind) + mirrored
-                )
-                difference = kernels.residual(predicted, batch.measured)
-                if step < _STEPS:
-                    kernels.photometric(difference * learned, batch.measured).backward()
-                    optimiser.step(1.0 - step / _STEPS)
-        for name, (_, numbers) in batch.parts.items():
-            judged = (~learned & usable)[numbers]
-            out[name].append(float(difference.detach()[numbers][judged].square().mean()))
-    return out
+    squared = [squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)]
+    parts = judged.batch.parts.items()
+    return {name: [float(errors[numbers][judged.usable[numbers]].mean()) for errors in squared] for name, (_, numbers) in parts}
 
 
 def degree_needed(errors: list[float], worth: float) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,18 +11,16 @@ from torch import Tensor
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.field.radiance import Shader
+from mmsynth.fitting.candidates import Look, look, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.decisions import DEGREES
 from mmsynth.fitting.measurements import Batch, Measurements, draw
-from mmsynth.fitting.optimiser import Adam
 from mmsynth.fitting.recipe import RadianceRecipe
 
 _RAYS = 4096  # per modality
-_STEPS = 40
-_RATE = 4e-3
 _SURE = 2.0  # standard errors of what lamps save
 _FARTHER = 2.0  # than the cameras: where lamps are looked for first
+_FAINT = 0.01  # of the power of all mirrored light: a lamp that was not there, or that another one has taken the place of
 _BRIGHTEST = 3.0  # times the typical value: what is brighter does not say more
 
 
@@ -78,39 +75,36 @@ def decide_light(
 ) -> Choice[bool]:
     """Whether the lamps of a field that has learned with them are worth it.
 
-    Two copies of the shader learn on from half of some rays, geometry and features held fixed, one of them without the lamps; on the
-    other half they are compared.
+    Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``.
     """
     if recipe.light == "off":
         return switch(False, "asked for by the recipe")
     if not field.shines:
         return switch(False, "from no direction surfaces are brighter than from others")
-    look = _look(field, measurements, sampling, seed)
-    batch = look.batch
-    mirrored = field.mirrored(look.hits, batch.origins, batch.directions, batch.measured, sampling.active_surface).detach()
-    lit, unlit = (_errors(field.shader, look, light) for light in (mirrored, torch.zeros_like(mirrored)))
+    random = np.random.default_rng((seed, 10))
+    learned, judged = (look(field, measurements, rays, sampling, random) for rays in (_RAYS // 2, _RAYS))
+    relative = judged.batch.measured.level.square()[judged.usable]
+    lit, unlit = (squared_errors(field.shader, learned, judged, DEGREES, mirrors)[judged.usable] / relative for mirrors in (True, False))
     whole = float(unlit.mean())
     saved, unsure = (0.0, 0.0) if whole == 0 else (1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole)
-    count = 0 if field.light is None else int(field.light.count)
-    why = f"{count} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of the error of rays not learned from"
+    lamps = keep_bright_lamps(field, judged, sampling)
+    why = f"{lamps} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of the error of rays not learned from"
     if recipe.light == "on":
         return switch(True, f"asked for by the recipe; {why}")
     worth = max(recipe.light_min_improvement, _SURE * unsure)
     return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.1%} asked for")
 
 
-def _errors(shader: Shader, look: _Look, mirrored: Tensor) -> Tensor:
-    """Squared errors of numbers at rays of odd number, relative to the modality's level, after a copy of the shader has learned from the
-    others, beside mirrored light (M,)."""
-    m, hits = look.batch.measured, look.hits
-    learned, usable = m.ray % 2 == 0, m.target < m.saturation
-    candidate = copy.deepcopy(shader)
-    parameters = dict(candidate.named_parameters())
-    optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
-    for step in range(_STEPS + 1):
-        predicted = kernels.predict(candidate(hits.features, look.directions, DEGREES), hits.share, m, hits.behind)
-        difference = kernels.residual(predicted + mirrored, m)
-        if step < _STEPS:
-            kernels.photometric(difference * learned, m).backward()
-            optimiser.step(1.0 - step / _STEPS)
-    return (difference / m.level).detach().square()[~learned & usable]
+@torch.no_grad()
+def keep_bright_lamps(field: Field, seen: Look, sampling: kernels.Sampling) -> int:
+    """Give up the lamps of which surfaces mirror next to nothing: how many are left."""
+    light, batch = field.light, seen.batch
+    assert light is not None
+    power, used = torch.zeros(len(light.used), device=field.device), light.used.clone()
+    for k in torch.nonzero(used)[:, 0]:
+        light.used.zero_()
+        light.used[k] = True
+        alone = field.mirrored(seen.hits, batch.origins, batch.directions, batch.measured, sampling.active_surface)
+        power[k] = (alone / batch.measured.level).square().mean()
+    light.used.copy_(used & (power >= _FAINT * power.sum()))
+    return light.count

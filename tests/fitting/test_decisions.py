@@ -6,6 +6,7 @@ import torch
 
 from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
+from mmsynth.fitting.candidates import Look
 from mmsynth.fitting.decisions import DEGREES, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
@@ -44,28 +45,31 @@ def test_one_odd_frame_is_no_exposure() -> None:
 def test_the_degree_that_light_has_is_found(needed: int) -> None:
     """One grey modality whose light is a harmonic of the direction, and a shader that was taught it with all directions."""
     torch.manual_seed(0)
-    rays = 4096
-    directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=1)
-    x, y, _ = directions.unbind(1)
-    light = 1.0 + 0.5 * {0: 0 * x, 1: x, 3: x * (x * x - 3 * y * y)}[needed] + 0.05 * torch.randn(rays)
+    rays = 2048
     shader = Shader(2, 32, {"grey": Sensor("grey", ("L",), (550.0,))}, {"grey": 1.0})
-    ones = torch.ones(rays)
-    every = torch.arange(rays)
-    batch = Batch(
-        origins=torch.zeros(rays, 3), directions=directions, frame=0 * every,
-        measured=kernels.Measured(light, every, 0 * every, torch.empty(0, 3), ones, 9 * ones, ones / rays),
-        parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"),
-    )  # fmt: skip
-    teacher = torch.optim.Adam(shader.parameters(), lr=8e-3)
+    ones, every = torch.ones(rays), torch.arange(rays)
+
+    def seen() -> Look:
+        directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=1)
+        x, y, _ = directions.unbind(1)
+        light = 1.0 + 0.5 * {0: 0 * x, 1: x, 3: x * (x * x - 3 * y * y)}[needed] + 0.05 * torch.randn(rays)
+        batch = Batch(
+            origins=torch.zeros(rays, 3), directions=directions, frame=0 * every,
+            measured=kernels.Measured(light, every, 0 * every, torch.empty(0, 3), ones, 9 * ones, ones / rays),
+            parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"),
+        )  # fmt: skip
+        hits = kernels.Hits(torch.zeros(rays, 2), ones, ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
+        return Look(batch, hits, torch.zeros(rays))
+
+    learned, judged = seen(), seen()
+    m, teacher = learned.batch.measured, torch.optim.Adam(shader.parameters(), lr=8e-3)
     for _ in range(150):
         teacher.zero_grad()
-        kernels.photometric(
-            kernels.predict(shader(torch.zeros(rays, 2), directions, DEGREES), ones, batch.measured) - light, batch.measured
-        ).backward()
+        outputs = shader(torch.zeros(rays, 2), learned.batch.directions, DEGREES)
+        kernels.photometric(kernels.predict(outputs, ones, m) - m.target, m).backward()
         teacher.step()
     before = [p.detach().clone() for p in shader.parameters()]
-    hits = kernels.Hits(torch.zeros(rays, 2), ones, ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
-    errors = errors_by_degree(shader, hits, batch, torch.zeros(rays))["grey"]
+    errors = errors_by_degree(shader, learned, judged)["grey"]
     assert len(errors) == DEGREES + 1
     assert degree_needed(errors, worth=0.1) == needed, errors
     assert all(bool((p == q).all()) for p, q in zip(shader.parameters(), before, strict=True))  # copies learned, not the shader

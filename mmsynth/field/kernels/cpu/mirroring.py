@@ -44,9 +44,10 @@ def _softplus(x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _terms(row, k, lamps, mirrors, out):  # type: ignore[no-untyped-def]
+def _terms(row, k, lamps, mirrors, polarized, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.reflect``, of one surface and lamp.
 
+    polarized: whether axis and degree are needed.
     out: the lamp's direction 0:3 and distance 3, the half vector 4:7 and its length 7, n × h 8:11, off 11, n·l 12, n·v 13, the two factors
     below seen 14, 15 (see ``_amount``), 0.25 F or 0 where h is behind 16, axis 17:20, degree 20.
     """
@@ -69,6 +70,8 @@ def _terms(row, k, lamps, mirrors, out):  # type: ignore[no-untyped-def]
     away = _ONE - incidence
     fresnel = _ONE + (_ONE / _AT_NORMAL - _ONE) * away * away * away * away * away
     out[16] = _f(0.25) * fresnel if nx * hx + ny * hy + nz * hz > _ZERO else _ZERO
+    if not polarized:
+        return
     ax, ay, az = vy * hz - vz * hy, vz * hx - vx * hz, vx * hy - vy * hx
     across = max(_f(math.sqrt(ax * ax + ay * ay + az * az)), _TINY)
     out[17], out[18], out[19] = ax / across, ay / across, az / across
@@ -79,14 +82,13 @@ def _terms(row, k, lamps, mirrors, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _amount(row, k, raw, terms):  # type: ignore[no-untyped-def]
+def _amount(alpha, strength, visible, terms):  # type: ignore[no-untyped-def]
     """Relative light of one surface and lamp; fills A and B of the terms."""
-    alpha = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0])
     square, c = alpha * alpha, _f(0.5) * alpha
     terms[14] = terms[12] * (_ONE - c) + c
     terms[15] = terms[13] * (_ONE - c) + c
     u = square / (square + (_ONE - square) * terms[11])
-    return u * u * terms[12] / (terms[14] * terms[15]) * terms[16] * _softplus(raw[row, 1]) * _sigmoid(raw[row, 2 + k])
+    return u * u * terms[12] / (terms[14] * terms[15]) * terms[16] * strength * visible
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -101,19 +103,25 @@ def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-de
     """See ``mirroring.mirror``; ``measured.ray`` never decreases."""
     rays, count = behind.shape[0], lamps.position.shape[0]
     bright = len(measured.ray) - len(measured.axes)
+    raw = mirrors.material
     for task in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(task) * CHUNK
         end = min(begin + CHUNK, rays)
         terms = np.empty(21, np.float32)
-        for m in range(first_at(measured.ray, begin), first_at(measured.ray, end)):
-            out[m] = _ZERO
+        last = first_at(measured.ray, begin)
         for o in range(begin, end):
-            first, last = first_at(measured.ray, o), first_at(measured.ray, o + 1)
+            first = last
+            while last < len(measured.ray) and measured.ray[last] == o:
+                out[last] = _ZERO
+                last += 1
             for which in range(2 if behind[o] >= 0 else 1):
                 row = o if which == 0 else behind[o]
-                for k in range(count if mirrors.share[row] > _ZERO else 0):
-                    _terms(row, k, lamps, mirrors, terms)
-                    amount = mirrors.share[row] * _amount(row, k, mirrors.material, terms)
+                if mirrors.share[row] <= _ZERO:
+                    continue
+                alpha, strength = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0]), _softplus(raw[row, 1])
+                for k in range(count):
+                    _terms(row, k, lamps, mirrors, last > bright, terms)
+                    amount = mirrors.share[row] * _amount(alpha, strength, _sigmoid(raw[row, 2 + k]), terms)
                     for m in range(first, last):
                         passed = _ONE if m < bright else _passed(terms, measured.axes, m - bright)
                         out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
@@ -131,8 +139,11 @@ def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[n
         begin = chunk * CHUNK
         terms = np.empty(21, np.float32)
         g_position[chunk], g_spectrum[chunk] = _ZERO, _ZERO
+        last = first_at(measured.ray, begin)
         for o in range(begin, min(begin + CHUNK, rays)):
-            first, last = first_at(measured.ray, o), first_at(measured.ray, o + 1)
+            first = last
+            while last < len(measured.ray) and measured.ray[last] == o:
+                last += 1
             for which in range(2 if behind[o] >= 0 else 1):
                 row = o if which == 0 else behind[o]
                 g_share[row] = _ZERO
@@ -147,8 +158,9 @@ def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[n
                 strength, slope = _softplus(raw[row, 1]), _sigmoid(raw[row, 1])
                 g_alpha = _ZERO
                 for k in range(count):
-                    _terms(row, k, lamps, mirrors, terms)
-                    amount = _amount(row, k, raw, terms)
+                    visible = _sigmoid(raw[row, 2 + k])
+                    _terms(row, k, lamps, mirrors, last > bright, terms)
+                    amount = _amount(alpha, strength, visible, terms)
                     pull = _ZERO
                     for m in range(first, last):
                         passed = g[m] if m < bright else g[m] * _passed(terms, measured.axes, m - bright)
@@ -158,7 +170,6 @@ def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[n
                     if terms[16] == _ZERO:
                         continue
                     pull *= share
-                    visible = _sigmoid(raw[row, 2 + k])
                     rest = terms[16] * strength * visible
                     off, nl, nv, a, b = terms[11], terms[12], terms[13], terms[14], terms[15]
                     under = square + (_ONE - square) * off

@@ -1,0 +1,71 @@
+"""What the shader would reach if it were another: copies learn on for some steps, geometry and appearance held fixed, and are compared at
+rays that none of them has learned from.
+
+A copy that can do without something has learned to by then. (Asking only what the shader loses when something is taken from it would not
+tell: it uses what it is given, needed or not.)
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmsynth.field import kernels, rendering
+from mmsynth.field.field import Field
+from mmsynth.field.radiance import Shader
+from mmsynth.fitting.measurements import Batch, Measurements, draw
+from mmsynth.fitting.optimiser import Adam
+
+_STEPS = 40
+_RATE = 4e-3
+
+
+@dataclass(frozen=True)
+class Look:
+    """Rays of all modalities, the surfaces that they met, and the light (M,) in each number that is mirrored and not the shader's."""
+
+    batch: Batch
+    hits: kernels.Hits
+    mirrored: Tensor
+
+    @property
+    def usable(self) -> Tensor:
+        """(M,) which numbers can be judged: clipped ones cannot."""
+        return self.batch.measured.target < self.batch.measured.saturation
+
+
+@torch.no_grad()
+def look(field: Field, measurements: dict[str, Measurements], rays: int, sampling: kernels.Sampling, random: np.random.Generator) -> Look:
+    """So many rays of each modality, as the field renders them."""
+    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, field.device)
+    jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
+    hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+    return Look(batch, hits, field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface))
+
+
+def squared_errors(shader: Shader, learned: Look, judged: Look, degree: int, mirrors: bool = True) -> Tensor:
+    """Squared errors of the numbers of one look, (M,), by a copy of the shader that has learned on from another.
+
+    Args:
+        degree: of the harmonics of the direction that the copy sees. mirrors: whether mirrored light is added to its own.
+    """
+    candidate = copy.deepcopy(shader)
+    parameters = dict(candidate.named_parameters())
+    optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
+    for step in range(_STEPS):
+        loss, _ = _compare(candidate, learned, degree, mirrors)
+        loss.backward()
+        optimiser.step(1.0 - step / _STEPS)
+    with torch.no_grad():
+        return _compare(candidate, judged, degree, mirrors)[1]
+
+
+def _compare(shader: Shader, seen: Look, degree: int, mirrors: bool) -> tuple[Tensor, Tensor]:
+    hits, batch = seen.hits, seen.batch
+    degrees = torch.full((len(batch.origins),), degree, device=batch.origins.device)
+    rays = kernels.ShadedRays(hits.features, hits.share, hits.behind, batch.directions, degrees, degrees >= 0)
+    return kernels.compare(shader.weights(), rays, batch.measured, None, seen.mirrored / batch.measured.level if mirrors else None)
