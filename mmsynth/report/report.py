@@ -180,6 +180,7 @@ def _score_note(evaluation: Mapping[str, Any], unit: str) -> str:
         labels = {
             "depth_mae": f"depth error {{:.4g}} {unit}",
             "normal_mae_deg": "normal error {:.2f}°",
+            "normal_median_deg": "median {:.2f}°",
             "hit_rate": "surface hit {:.1%}",
             "chamfer_visible": f"Chamfer {{:.4g}} {unit}",
         }

@@ -18,7 +18,8 @@ averaged per view in dB):
 * ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``dolp_rmse``; ``aolp_mae``:
   circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
   at the own pose.
-* geometry, at the RGB pose, in the region: ``depth_mae`` (z-depth, scene unit) and ``normal_mae_deg`` where both have a surface,
+* geometry, at the RGB pose, in the region: ``depth_mae`` (z-depth, scene unit), ``normal_mae_deg`` and
+  ``normal_median_deg`` where both have a surface,
   ``hit_rate``: the share of true surface pixels that hit one; ``chamfer_visible``: mean distance from the field's surface points to
   the nearest true one and back, averaged, between the points that the test views see (a ground-truth mesh also has undersides
   that no camera saw). Only for scenes in metres, as the truth is.
@@ -80,7 +81,7 @@ def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, 
         _at_rgb_pose(exam, frame)
     return {
         "modalities": {name: _summary(exam.scores[name], exam.own_pose[name]) for name in exam.scores if exam.scores[name].means},
-        "geometry": _values(exam.geometry, ("depth_mae", "normal_mae_deg", "hit_rate")) | _chamfer(exam.points, exam.true_points),
+        "geometry": _geometry(exam),
         "views": sorted({frame.view for frame in frames}),
         "seconds": {"render": exam.seconds, "total": time.perf_counter() - began},
         "rays_per_s": exam.rays / max(exam.seconds, 1e-9),
@@ -108,6 +109,7 @@ class _Exam:
         self.geometry = _Scores()
         self.points: list[np.ndarray] = []
         self.true_points: list[np.ndarray] = []
+        self.normal_errors: list[np.ndarray] = []  # degrees
         self.rays, self.seconds = 0, 0.0
 
     def check_masks(self, frames: Sequence[Frame]) -> None:
@@ -162,7 +164,7 @@ def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
                 _score_truth(exam.scores[name], f"psnr_{part}", sensor, rendering, light, pixels)
         _score_light(exam.scores[name], sensor, rendering, light, where)
     if "depth_z" in shape and exam.metric:  # the truth is in metres
-        _score_geometry(exam.geometry, rendering, shape, where)
+        _score_geometry(exam, rendering, shape, where)
         surface = where & rendering.valid
         seen = lambda depth_z: _seen_points(exam.field, frame, depth_z)
         exam.points.append(seen(rendering.depth_z)[surface & np.isfinite(rendering.depth_z)])
@@ -274,15 +276,23 @@ def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: n
         scores.add("sam", spectral_angle_deg(rendering.channels[sensor.name][where], truth[where]))
 
 
-def _score_geometry(scores: _Scores, rendering: Rendering, truth: dict[str, np.ndarray], region: np.ndarray) -> None:
+def _score_geometry(exam: _Exam, rendering: Rendering, truth: dict[str, np.ndarray], region: np.ndarray) -> None:
     surface = region & (truth["depth_z"] > 0) & rendering.valid
     both = surface & np.isfinite(rendering.depth_z)
-    scores.add("hit_rate", both[surface])
-    scores.add("depth_mae", np.abs(rendering.depth_z[both] - truth["depth_z"][both]))
+    exam.geometry.add("hit_rate", both[surface])
+    exam.geometry.add("depth_mae", np.abs(rendering.depth_z[both] - truth["depth_z"][both]))
     if "normal" in truth:
         a, b = rendering.normal[both].astype(np.float64), truth["normal"][both].astype(np.float64)
         known = np.isfinite(a).all(-1) & (np.linalg.norm(b, axis=-1) > 0.5)
-        scores.add("normal_mae_deg", spectral_angle_deg(a[known], b[known]))
+        exam.normal_errors.append(np.asarray(spectral_angle_deg(a[known], b[known])))
+
+
+def _geometry(exam: _Exam) -> dict[str, float]:
+    """All that is known of the surface's errors."""
+    out = _values(exam.geometry, ("depth_mae", "hit_rate")) | _chamfer(exam.points, exam.true_points)
+    errors = np.concatenate(exam.normal_errors) if exam.normal_errors else np.empty(0)
+    errors = errors[np.isfinite(errors)]
+    return out | ({"normal_mae_deg": float(errors.mean()), "normal_median_deg": float(np.median(errors))} if len(errors) else {})
 
 
 def _seen_points(field: Field, frame: Frame, depth_z: np.ndarray) -> np.ndarray:

@@ -53,7 +53,9 @@ def test_truth_scores_perfectly(tmp_path: Path) -> None:
     assert result["modalities"]["pol"]["aolp_mae"] < 1e-4
     assert result["modalities"]["ms"]["sam"] < 1e-4
     assert "sam" not in result["modalities"]["rgb"]
-    assert result["geometry"] == {"depth_mae": 0.0, "normal_mae_deg": 0.0, "hit_rate": 1.0, "chamfer_visible": 0.0}
+    assert result["geometry"] == {
+        "depth_mae": 0.0, "normal_mae_deg": 0.0, "normal_median_deg": 0.0, "hit_rate": 1.0, "chamfer_visible": 0.0,
+    }  # fmt: skip
     assert calls == sorted(calls) and calls[-1][0] == calls[-1][1]
 
 
