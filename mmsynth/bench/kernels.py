@@ -186,7 +186,7 @@ def _mirror_inputs(samples: int) -> Inputs:
     seen = {"target": one, "ray": torch.arange(samples), "level": one, "saturation": one, "weight": one}
     output = torch.cat([torch.randint(3, (samples - tensors,), generator=g), torch.full((tensors,), 3)])
     return {
-        "position": 4.0 * unit(3), "spectrum": torch.rand(3, 9, generator=g) + 0.5, "material": torch.randn(samples, 5, generator=g),
+        "position": 4.0 * unit(3), "spectrum": torch.rand(3, 9, generator=g) + 0.5, "material": torch.randn(samples, 8, generator=g),
         "normals": normals, "points": 0.5 * torch.randn(samples, 3, generator=g), "share": torch.rand(samples, generator=g),
         "directions": nn.functional.normalize(0.7 * unit(samples) - normals, dim=1), "behind": torch.full((samples,), -1),
         "output": output, "axes": unit(tensors), **seen,

@@ -16,7 +16,7 @@ from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.kernels.mirroring import material
-from mmsynth.field.light import Light, stokes
+from mmsynth.field.light import Light, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
@@ -222,6 +222,7 @@ class Field(nn.Module):
         lamps = self.light.lamps() if self.light is not None and self.shines and modalities else None
         mirrors = None if lamps is None else self.mirrors(hits, origins, directions, self.sampling.active_surface)[0]
         images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
+        around = None if mirrors is None else kernels.surround(mirrors)
         outputs = {d: self.shader(shaded.features, directions[ray], d) for d in {self.view_dependence[n] for n in modalities}}
 
         def together(values: Tensor, share: Tensor) -> Tensor:
@@ -248,17 +249,17 @@ class Field(nn.Module):
             x, y = (axis[ray] for axis in reference_axes(directions, camera_x))
             behind, vectors = self.shader.polarized(name, raw, x, y, torch.deg2rad(torch.tensor(angles, device=origins.device)))
             out[name], out[f"stokes/{name}"] = together(behind, shaded.share), together(vectors, shaded.share)
-            if lamps is not None and images is not None:
-                more = scale * together(stokes(images, lamps.spectrum[:, self.shader.columns[name].start], x, y), hits.share)
-                mirrored = stokes_to_intensities(more, angles)
+            if lamps is not None and images is not None and around is not None:
+                of_lamps = scale * together(stokes(images, lamps.spectrum[:, self.shader.columns[name].start], x, y), hits.share)
+                more = of_lamps + scale * together(stokes_around(around, x, y), hits.share)
                 out[f"stokes/{name}"] += more
-                out[name] += mirrored
+                out[name] += stokes_to_intensities(more, angles)
                 if light:
-                    out[f"mirrored/{name}"], out[f"mirrored_s0/{name}"] = mirrored, more[:, 0]
+                    out[f"mirrored/{name}"], out[f"mirrored_s0/{name}"] = stokes_to_intensities(of_lamps, angles), of_lamps[:, 0]
         if light and mirrors is not None:
-            roughness, strength, _ = material(mirrors.material)
+            of = material(mirrors.material)
             met = torch.where(hits.opacity > 0.5, hits.opacity, torch.full_like(hits.opacity, float("nan")))
-            for key, value in (("roughness", roughness), ("strength", strength)):
+            for key, value in (("roughness", of.roughness), ("strength", of.strength)):
                 out[key] = together(value[:, None], hits.share)[:, 0] / met
         if geometry:
             # of the surface at which half of the light is met

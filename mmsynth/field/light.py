@@ -12,12 +12,14 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mmsynth.field.kernels import Lamps, Reflection
+from mmsynth.field.kernels import Lamps, Reflection, Surroundings
 
 LAMPS = 6  # at the most
 _HIDDEN = 32
 _CHUNK = 64  # surfaces
-_START = (-1.0, -2.0, 2.0)  # roughness, strength and visibility before their functions: 0.28, 0.13, 0.88
+# roughness, strength, surroundings, transmitted, polarizing before their functions: 0.28, 0.13, 0.05, 0.02, 0.88
+_START = (-1.0, -2.0, -3.0, -4.0, 2.0)
+_VISIBLE = 2.0  # before its function: 0.88
 
 
 class Light(nn.Module):
@@ -34,9 +36,9 @@ class Light(nn.Module):
 
     def __init__(self, features: int, outputs: int) -> None:
         super().__init__()
-        self.first, self.second = nn.Linear(features, _HIDDEN), nn.Linear(_HIDDEN, 2 + LAMPS)
+        self.first, self.second = nn.Linear(features, _HIDDEN), nn.Linear(_HIDDEN, len(_START) + LAMPS)
         with torch.no_grad():
-            self.second.bias.copy_(torch.tensor([*_START[:2], *[_START[2]] * LAMPS]))
+            self.second.bias.copy_(torch.tensor([*_START, *[_VISIBLE] * LAMPS]))
         self.position = nn.Parameter(torch.zeros(LAMPS, 3))
         self.log_spectrum = nn.Parameter(torch.zeros(LAMPS, outputs))
         self.register_buffer("used", torch.zeros(LAMPS, dtype=torch.bool))
@@ -53,7 +55,7 @@ class Light(nn.Module):
             self.used.copy_(torch.arange(LAMPS) < len(positions))
 
     def material(self, features: Tensor) -> Tensor:
-        """What surfaces do with the lamps, (H, F) → (H, 2 + K): see ``kernels.mirroring.material``."""
+        """What surfaces do with the lamps, (H, F) → (H, 5 + K): see ``kernels.mirroring.material``."""
         rows = len(features)
         # products of a fixed size: sums do not depend on the number of threads
         chunks = nn.functional.pad(features, (0, 0, 0, -rows % _CHUNK)).view(-1, _CHUNK, features.shape[1])
@@ -61,8 +63,8 @@ class Light(nn.Module):
         return _layer(hidden, self.second).reshape(-1, self.second.out_features)[:rows, self._columns()]
 
     def _columns(self) -> Tensor:
-        """Of the last layer: roughness, strength, and the visibility of the lamps that there are."""
-        return torch.cat([torch.arange(2, device=self.used.device), 2 + torch.nonzero(self.used)[:, 0]])
+        """Of the last layer: all but the visibility of lamps that there are not."""
+        return torch.cat([torch.arange(len(_START), device=self.used.device), len(_START) + torch.nonzero(self.used)[:, 0]])
 
     def lamps(self) -> Lamps:
         """What the kernels take."""
@@ -74,12 +76,18 @@ def _layer(chunks: Tensor, layer: nn.Linear) -> Tensor:
 
 
 def stokes(reflection: Reflection, spectrum: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Stokes vectors (H, 3) of what is mirrored, in the frame of axes x, y (H, 3), of lamps of ``spectrum`` (K,)."""
+    """Stokes vectors (H, 3) of the images of lamps of ``spectrum`` (K,), in the frame of axes x, y (H, 3)."""
     light = reflection.amount * spectrum
     on_x, on_y = ((reflection.axis * axis[:, None]).sum(-1) for axis in (x, y))
     polarized = light * reflection.degree
     parts = light, polarized * (on_x.square() - on_y.square()), polarized * 2.0 * on_x * on_y
     return torch.stack([part.sum(1) for part in parts], -1)
+
+
+def stokes_around(around: Surroundings, x: Tensor, y: Tensor) -> Tensor:
+    """Stokes vectors (H, 3) of light from all around, in the frame of axes x, y (H, 3)."""
+    on_x, on_y = ((around.axis * axis).sum(-1) for axis in (x, y))
+    return torch.stack([around.light, around.polarized * (on_x.square() - on_y.square()), around.polarized * 2.0 * on_x * on_y], -1)
 
 
 _DIRECTIONS = 1500  # about 5 degrees apart

@@ -46,7 +46,7 @@ def run_kernels() -> None:
         measured = kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one)
         loss, _ = kernels.compare(weights, rays, measured)
         lamps, share = kernels.Lamps(torch.ones(1, 3, requires_grad=True), torch.ones(1, 1)), hits.share.detach()
-        mirrors = kernels.Mirrors(torch.zeros(1, 3), directions, directions, directions, share)
+        mirrors = kernels.Mirrors(torch.zeros(1, 6), directions, directions, directions, share)
         loss = loss + kernels.mirror(lamps, mirrors, hits.behind, measured).sum()
         (loss + surface(origins.detach(), 1).sum()).backward()
     with torch.no_grad():

@@ -259,7 +259,13 @@ def test_what_is_mirrored_and_the_rest_is_all_light(background: bool) -> None:
         render_light(field, camera, pose)
     field.light = Light(field.appearance.width, field.shader.heads.out_features)
     field.light.put(torch.tensor([[0.0, 0.0, -3.0], [2.0, 2.0, -1.0]]))
+    lit = field.render(camera, pose)
+    with torch.no_grad():
+        field.light.second.bias[2:4] = -60.0  # nothing of the surroundings, nothing transmitted
     whole, light = field.render(camera, pose), render_light(field, camera, pose)
+    for name in lit.channels:  # that is polarized light, of cameras that see it
+        more = np.abs(lit.channels[name] - whole.channels[name]).max()
+        assert more > 1e-3 if name in lit.stokes else more == 0.0
     for name, mirrored in light.mirrored.items():
         np.testing.assert_allclose(whole.channels[name], plain.channels[name] + mirrored, atol=1e-6, rtol=1e-5)
         assert (mirrored > 1e-3).sum() > 20 and (mirrored >= 0).all()

@@ -12,8 +12,8 @@ from torch.nn.functional import normalize
 
 from mmsynth.field import kernels
 from mmsynth.field.kernels import Lamps, Measured, Mirrors
-from mmsynth.field.kernels.mirroring import material, reflect
-from mmsynth.field.light import LAMPS, Light, find_lamps, stokes
+from mmsynth.field.kernels.mirroring import fresnel_degrees, material, reflect, surround
+from mmsynth.field.light import LAMPS, Light, find_lamps, stokes, stokes_around
 from mmsynth.sensors.polarization import stokes_to_intensities
 
 OUTPUTS = 9
@@ -31,7 +31,7 @@ def _case(rays: int, per_ray: int = 1, lamps: int = 3, polarized: float = 0.4) -
     share = torch.rand(rows, generator=g)
     share[:rays][(torch.rand(rays, generator=g) < 0.2) & (behind < 0)] = 0.0
     mirrors = Mirrors(
-        2.0 * normal(rows, 2 + lamps), normals, 0.5 * normal(rows, 3), normalize(0.7 * normal(rows, 3) - normals, dim=1), share
+        2.0 * normal(rows, 5 + lamps), normals, 0.5 * normal(rows, 3), normalize(0.7 * normal(rows, 3) - normals, dim=1), share
     )
     ray = torch.arange(rays).repeat_interleave(per_ray)
     axes = normalize(normal(int(polarized * rays) * per_ray, 3), dim=1)
@@ -91,7 +91,11 @@ def _one(
     """One surface at the origin, seen from and lit from directions."""
     vector = lambda x: normalize(torch.tensor([x], dtype=torch.float64), dim=1)
     mirrors = Mirrors(
-        torch.tensor([raw], dtype=torch.float64), vector(normal), torch.zeros(1, 3, dtype=torch.float64), -vector(viewer), torch.ones(1)
+        torch.tensor([[*raw[:2], 0.0, 0.0, 60.0, raw[2]]], dtype=torch.float64),
+        vector(normal),
+        torch.zeros(1, 3, dtype=torch.float64),
+        -vector(viewer),
+        torch.ones(1),
     )
     return reflect(5.0 * vector(lamp), mirrors)
 
@@ -104,10 +108,25 @@ def test_polarization_is_fresnels() -> None:
     np.testing.assert_allclose(brewster.axis[0, 0].abs(), [0.0, 1.0, 0.0], atol=1e-12)
 
 
+def test_light_from_all_around_is_polarized_as_fresnel_says() -> None:
+    """Against the equations by their amplitudes, in float64; and in float32 to rounding, head on and grazing."""
+    i = torch.linspace(0.01, 1.56, 300, dtype=torch.float64)
+    t = torch.asin(i.sin() / 1.5)
+    perpendicular, parallel = ((i - t).sin() / (i + t).sin()).square(), ((i - t).tan() / (i + t).tan()).square()
+    _, mirrored, transmitted = fresnel_degrees(i.cos())
+    square = i.sin().square()
+    torch.testing.assert_close(mirrored * square, (perpendicular - parallel) / (perpendicular + parallel), atol=1e-9, rtol=1e-7)
+    torch.testing.assert_close(transmitted * square, (perpendicular - parallel) / (2.0 - perpendicular - parallel), atol=1e-9, rtol=1e-7)
+    c = torch.tensor([1.0, 1.0 - 1e-7, 1e-7, 0.0])
+    for found, expected in zip(fresnel_degrees(c), fresnel_degrees(c.double()), strict=True):
+        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
+
+
 def test_a_mirror_is_brightest_where_the_angles_are_equal() -> None:
     """At the top of a lobe L = s V F / F(1) n·l / 4 (...): the closed form, and less beside it."""
     raw = (-2.0, 1.0, 3.0)
-    alpha, strength, visibility = (float(x) for x in material(torch.tensor([raw], dtype=torch.float64)))
+    of = material(torch.tensor([[*raw[:2], 0.0, 0.0, 60.0, raw[2]]], dtype=torch.float64))
+    alpha, strength, visibility = (float(x) for x in (of.roughness, of.strength, of.visibility))
     cos = math.cos(math.radians(40.0))
     c = 0.5 * alpha
     seen = cos / (cos * (1 - c) + c) ** 2
@@ -126,7 +145,8 @@ def test_stokes_vectors_are_what_analysers_pass() -> None:
     for angle in (0.0, 30.0, 100.0):
         turned = math.radians(angle)
         found = kernels.mirror(lamps, mirrors, behind, measured._replace(axes=math.cos(turned) * x + math.sin(turned) * y))
-        vectors = mirrors.share[:, None] * stokes(reflect(lamps.position, mirrors), lamps.spectrum[:, 3], x, y)
+        vectors = stokes(reflect(lamps.position, mirrors), lamps.spectrum[:, 3], x, y) + stokes_around(surround(mirrors), x, y)
+        vectors = mirrors.share[:, None] * vectors
         torch.testing.assert_close(found, stokes_to_intensities(vectors, (angle,))[:, 0], atol=1e-6, rtol=1e-5)
         assert (vectors[:, 1:].norm(dim=1) <= vectors[:, 0] * (1 + 1e-6)).all()
 
@@ -143,7 +163,7 @@ def test_lamps_are_found_where_mirrored_rays_are_bright() -> None:
 
 def test_a_light_has_as_many_lamps_as_were_put() -> None:
     light = Light(8, OUTPUTS)
-    assert light.material(torch.randn(5, 8)).shape == (5, 2) and light.lamps().spectrum.shape == (0, OUTPUTS)
+    assert light.material(torch.randn(5, 8)).shape == (5, 5) and light.lamps().spectrum.shape == (0, OUTPUTS)
     light.put(torch.ones(2, 3))
-    assert light.material(torch.randn(5, 8)).shape == (5, 4) and light.lamps().position.shape == (2, 3)
+    assert light.material(torch.randn(5, 8)).shape == (5, 7) and light.lamps().position.shape == (2, 3)
     assert torch.equal(light.lamps().spectrum, torch.ones(2, OUTPUTS))

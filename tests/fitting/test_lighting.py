@@ -97,13 +97,13 @@ def test_lamps_stand_beyond_the_cameras(scene: Scene) -> None:
 
 
 def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
-    """A surface without strength: the lamps save nothing, exactly."""
+    """A surface without strength, that polarizes nothing: the lamps save nothing, exactly."""
     trainer, sampling = _ready(scene)
     light = trainer.field.light
     assert light is not None
     with torch.no_grad():
-        light.second.weight[1] = 0.0
-        light.second.bias[1] = -200.0
+        light.second.weight[1:4] = 0.0
+        light.second.bias[1:4] = -200.0
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto", "light_min_improvement": 1e-6})
     choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0)
     assert not choice.value and "save 0.0%" in choice.why

@@ -26,7 +26,11 @@ def _mirrors(normals: Tensor, viewers: Tensor, raw: tuple[float, float, float]) 
     """Surfaces at the origin with normals (N, 3), seen from directions (N, 3)."""
     n = len(normals)
     return Mirrors(
-        torch.tensor(raw).to(normals).expand(n, 3).clone(), normals, torch.zeros_like(normals), -viewers, torch.ones(n).to(normals)
+        torch.tensor([*raw[:2], -30.0, -30.0, 30.0, raw[2]]).to(normals).expand(n, 6).clone(),
+        normals,
+        torch.zeros_like(normals),
+        -viewers,
+        torch.ones(n).to(normals),
     )
 
 
@@ -112,7 +116,7 @@ def test_normals_at_the_poles(row: Row) -> None:
 def test_a_mirror_seen_head_on_is_not_polarized(row: Row) -> None:
     """Lamp, viewer and normal in one line: v × h has no direction, and the degree is 0 whatever the axis."""
     n = torch.tensor([UP, (0.0, 1.0, 0.0)])
-    image = reflect(4.0 * n, _mirrors(n, n, (0.0, 0.0, 0.0))._replace(material=torch.zeros(2, 4)))
+    image = reflect(4.0 * n, _mirrors(n, n, (0.0, 0.0, 0.0))._replace(material=torch.zeros(2, 7)))
     usual = torch.linalg.cross(n, n) / torch.linalg.cross(n, n).norm(dim=1, keepdim=True)
     own = image.degree.diagonal()
     assert usual.isnan().all() and torch.isfinite(image.axis).all() and float(own.abs().max()) < 1e-6

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mmsynth.field.kernels import cpu, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
-from mmsynth.field.kernels.mirroring import Reflection, reflect
+from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
     GridTable,
     Hits,
@@ -36,10 +36,41 @@ from mmsynth.field.kernels.reference import contract, contracted_velocity
 from mmsynth.field.kernels.shading import intensity, photometric, predict, radiance, rays_of, residual
 
 __all__ = [
-    "OUTSIDE", "SHELL", "SOLID", "GridTable", "Hits", "Lamps", "Measured", "Mirrors", "Rays", "Reflection", "Samples", "Sampling",
-    "ShadedRays", "ShaderWeights", "SurfaceNetwork",
-    "adam", "compare", "contract", "contracted_velocity", "hash_encode", "intensity", "march", "mirror", "photometric", "predict",
-    "radiance", "rays_of", "reflect", "residual", "section_weights", "shade", "surface_value", "trace",
+    "OUTSIDE",
+    "SHELL",
+    "SOLID",
+    "GridTable",
+    "Hits",
+    "Lamps",
+    "Measured",
+    "Mirrors",
+    "Rays",
+    "Reflection",
+    "Samples",
+    "Sampling",
+    "ShadedRays",
+    "ShaderWeights",
+    "SurfaceNetwork",
+    "Surroundings",
+    "adam",
+    "compare",
+    "contract",
+    "contracted_velocity",
+    "hash_encode",
+    "intensity",
+    "march",
+    "mirror",
+    "photometric",
+    "predict",
+    "radiance",
+    "rays_of",
+    "reflect",
+    "residual",
+    "section_weights",
+    "shade",
+    "surface_value",
+    "surround",
+    "trace",
 ]  # fmt: skip
 
 

@@ -159,7 +159,7 @@ class Mirrors(NamedTuple):
     """H surfaces that rays meet, see ``Hits``.
 
     Attributes:
-        material: (H, 2 + K) before its functions: roughness, strength, visibility of each lamp. normals, points: (H, 3), normalised frame.
+        material: (H, 5 + K) before its functions, see ``mirroring.Material``. normals, points: (H, 3), normalised frame.
         directions: (H, 3) of the rays that meet them, unit. share: (H,).
     """
 

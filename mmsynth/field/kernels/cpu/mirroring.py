@@ -23,7 +23,7 @@ _ZERO, _ONE, _TWO = _f(0.0), _f(1.0), _f(2.0)
 
 
 class Gradients(NamedTuple):
-    """Of ``Mirrors`` per row: material (H, 2 + K), normals (H, 3), share (H,); of the lamps per chunk: position (C, K, 3), spectrum
+    """Of ``Mirrors`` per row: material (H, 5 + K), normals (H, 3), share (H,); of the lamps per chunk: position (C, K, 3), spectrum
     (C, K, outputs)."""
 
     material: np.ndarray
@@ -91,6 +91,22 @@ def _amount(alpha, strength, visible, terms):  # type: ignore[no-untyped-def]
     return u * u * terms[12] / (terms[14] * terms[15]) * terms[16] * strength * visible
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _around(row, mirrors, out):  # type: ignore[no-untyped-def]
+    """See ``mirroring.surround``, of one surface. out: w 0:3, |w|² 3, F / F(1) 4, D_m and D_t over sin² 5, 6."""
+    vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
+    nx, ny, nz = mirrors.normals[row, 0], mirrors.normals[row, 1], mirrors.normals[row, 2]
+    wx, wy, wz = vy * nz - vz * ny, vz * nx - vx * nz, vx * ny - vy * nx
+    out[0], out[1], out[2], out[3] = wx, wy, wz, wx * wx + wy * wy + wz * wz
+    c = min(max(vx * nx + vy * ny + vz * nz, _ZERO), _ONE)
+    square, away = _ONE - c * c, _ONE - c
+    inner = _f(math.sqrt(_ONE - square / (_INDEX * _INDEX)))
+    product, along, less = c * inner, square / _INDEX, inner - c / _INDEX
+    out[4] = _ONE + (_ONE / _AT_NORMAL - _ONE) * away * away * away * away * away
+    out[5] = _TWO * product / _INDEX / (product * product + along * along)
+    out[6] = less * less / (_ONE + (product + along) * (product + along))
+
+
 @njit(cache=True, inline="always", error_model="numpy")
 def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
     """Share of the light behind an analyser."""
@@ -119,9 +135,20 @@ def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-de
                 if mirrors.share[row] <= _ZERO:
                     continue
                 alpha, strength = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0]), _softplus(raw[row, 1])
+                if last > bright:
+                    _around(row, mirrors, terms)
+                    mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
+                    light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
+                    for m in range(first, last):
+                        e = terms[0] * measured.axes[m - bright, 0] + terms[1] * measured.axes[m - bright, 1]
+                        e += terms[2] * measured.axes[m - bright, 2]
+                        out[m] += _f(0.5) * mirrors.share[row] * (light + polarized * (_TWO * e * e - terms[3]))
+                polarizing = _sigmoid(raw[row, 4])
                 for k in range(count):
                     _terms(row, k, lamps, mirrors, last > bright, terms)
-                    amount = mirrors.share[row] * _amount(alpha, strength, _sigmoid(raw[row, 2 + k]), terms)
+                    if last > bright:
+                        terms[20] *= polarizing
+                    amount = mirrors.share[row] * _amount(alpha, strength, _sigmoid(raw[row, 5 + k]), terms)
                     for m in range(first, last):
                         passed = _ONE if m < bright else _passed(terms, measured.axes, m - bright)
                         out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
@@ -156,14 +183,45 @@ def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[n
                 alpha = _LEAST + (_ONE - _LEAST) * gate
                 square, c = alpha * alpha, _f(0.5) * alpha
                 strength, slope = _softplus(raw[row, 1]), _sigmoid(raw[row, 1])
-                g_alpha = _ZERO
+                g_alpha, g_polarizing, polarizing = _ZERO, _ZERO, _sigmoid(raw[row, 4])
+                if last > bright:
+                    _around(row, mirrors, terms)
+                    wx, wy, wz = terms[0], terms[1], terms[2]
+                    mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
+                    light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
+                    gwx, gwy, gwz, whole, turned = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+                    for m in range(first, last):
+                        ex, ey, ez = measured.axes[m - bright, 0], measured.axes[m - bright, 1], measured.axes[m - bright, 2]
+                        e = wx * ex + wy * ey + wz * ez
+                        whole += _f(0.5) * g[m]
+                        turned += _f(0.5) * g[m] * (_TWO * e * e - terms[3])
+                        gwx += g[m] * (_TWO * e * ex - wx)
+                        gwy += g[m] * (_TWO * e * ey - wy)
+                        gwz += g[m] * (_TWO * e * ez - wz)
+                    g_share[row] += whole * light + turned * polarized
+                    g_material[row, 2] += share * (whole + turned * terms[5]) * terms[4] * _sigmoid(raw[row, 2])
+                    g_material[row, 3] += share * (whole - turned * terms[6]) * _sigmoid(raw[row, 3])
+                    # w = v × n
+                    vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
+                    pull = share * polarized
+                    g_normals[row, 0] += pull * (gwy * vz - gwz * vy)
+                    g_normals[row, 1] += pull * (gwz * vx - gwx * vz)
+                    g_normals[row, 2] += pull * (gwx * vy - gwy * vx)
                 for k in range(count):
-                    visible = _sigmoid(raw[row, 2 + k])
+                    visible = _sigmoid(raw[row, 5 + k])
                     _terms(row, k, lamps, mirrors, last > bright, terms)
                     amount = _amount(alpha, strength, visible, terms)
-                    pull = _ZERO
+                    pull, degree = _ZERO, terms[20]
+                    if last > bright:
+                        terms[20] *= polarizing
                     for m in range(first, last):
-                        passed = g[m] if m < bright else g[m] * _passed(terms, measured.axes, m - bright)
+                        passed = g[m]
+                        if m >= bright:
+                            passed *= _passed(terms, measured.axes, m - bright)
+                            e = terms[17] * measured.axes[m - bright, 0] + terms[18] * measured.axes[m - bright, 1]
+                            e += terms[19] * measured.axes[m - bright, 2]
+                            turned = g[m] * lamps.spectrum[k, measured.output[m]] * _f(0.5) * degree * (_TWO * e * e - _ONE)
+                            g_polarizing += share * amount * turned
                         pull += passed * lamps.spectrum[k, measured.output[m]]
                         g_spectrum[chunk, k, measured.output[m]] += passed * share * amount
                     g_share[row] += pull * amount
@@ -176,7 +234,7 @@ def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[n
                     u = square / under
                     lobe, seen = u * u, nl / (a * b)
                     g_material[row, 1] += pull * terms[16] * visible * lobe * seen * slope
-                    g_material[row, 2 + k] += pull * rest * lobe * seen * (_ONE - visible)
+                    g_material[row, 5 + k] += pull * rest * lobe * seen * (_ONE - visible)
                     g_off = -pull * rest * seen * _TWO * lobe * (_ONE - square) / under
                     g_square = pull * rest * seen * _TWO * u * off / (under * under)
                     g_nl = pull * rest * lobe * c / (a * a * b) if nl > _ZERO else _ZERO
@@ -200,4 +258,5 @@ def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[n
                     g_position[chunk, k, 0] += (gtx - along * tx) / terms[3]
                     g_position[chunk, k, 1] += (gty - along * ty) / terms[3]
                     g_position[chunk, k, 2] += (gtz - along * tz) / terms[3]
+                g_material[row, 4] = g_polarizing * polarizing * (_ONE - polarizing)
                 g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate * (_ONE - gate)
