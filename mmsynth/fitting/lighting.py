@@ -11,7 +11,7 @@ from torch import Tensor
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.fitting.candidates import Look, look, squared_errors
+from mmsynth.fitting.candidates import look, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.decisions import DEGREES
 from mmsynth.fitting.measurements import Batch, Measurements, draw
@@ -87,7 +87,7 @@ def decide_light(
     lit, unlit = (squared_errors(field.shader, learned, judged, DEGREES, mirrors)[judged.usable] / relative for mirrors in (True, False))
     whole = float(unlit.mean())
     saved, unsure = (0.0, 0.0) if whole == 0 else (1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole)
-    lamps = keep_bright_lamps(field, judged, sampling)
+    lamps = keep_bright_lamps(field, measurements, sampling, seed)
     why = f"{lamps} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of the error of rays not learned from"
     if recipe.light == "on":
         return switch(True, f"asked for by the recipe; {why}")
@@ -96,15 +96,16 @@ def decide_light(
 
 
 @torch.no_grad()
-def keep_bright_lamps(field: Field, seen: Look, sampling: kernels.Sampling) -> int:
+def keep_bright_lamps(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> int:
     """Give up the lamps of which surfaces mirror next to nothing: how many are left."""
+    seen = look(field, measurements, _RAYS // 2, sampling, np.random.default_rng((seed, 11)))
     light, batch = field.light, seen.batch
     assert light is not None
     power, used = torch.zeros(len(light.used), device=field.device), light.used.clone()
-    for k in torch.nonzero(used)[:, 0]:
-        light.used.zero_()
+    for k in torch.nonzero(used)[:, 0] if light.count > 1 else ():
+        light.used[k] = False
+        others = field.mirrored(seen.hits, batch.origins, batch.directions, batch.measured, sampling.active_surface)
         light.used[k] = True
-        alone = field.mirrored(seen.hits, batch.origins, batch.directions, batch.measured, sampling.active_surface)
-        power[k] = (alone / batch.measured.level).square().mean()
+        power[k] = ((seen.mirrored - others) / batch.measured.level).square().mean()
     light.used.copy_(used & (power >= _FAINT * power.sum()))
     return light.count

@@ -19,7 +19,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import losses
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
-from mmsynth.fitting.lighting import decide_light, look_for_lamps
+from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, in_order, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
@@ -180,6 +180,8 @@ class Trainer:
             field.view_dependence.update(dict.fromkeys(self.measurements, seen))
             if self.progress >= schedule.decide_at:
                 state.decided = decide(field, self.measurements, self.recipe.radiance, sampling, self.seed)
+                if field.shines:  # by now lamps have found their places
+                    keep_bright_lamps(field, self.measurements, sampling, self.seed)
                 self._see_directions(state.decided)
         if self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._look, sampling), self.progress)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mmsynth.field.storage import load_field
-from mmsynth.fitting.lighting import decide_light, look_for_lamps
+from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
@@ -107,3 +107,21 @@ def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto", "light_min_improvement": 1e-6})
     choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0)
     assert not choice.value and "save 0.0%" in choice.why
+
+
+def test_a_lamp_of_which_nothing_is_seen_is_given_up(scene: Scene) -> None:
+    trainer, sampling = _ready(scene)
+    light = trainer.field.light
+    assert light is not None and light.count > 1
+    before = light.count
+    lost = int(torch.nonzero(light.used)[0, 0])
+    with torch.no_grad():
+        light.log_spectrum[lost] = -20.0
+    left = keep_bright_lamps(trainer.field, trainer.measurements, sampling, 0)
+    assert 0 < left < before and left == light.count and not light.used[lost]
+    assert light.lamps().position.shape == (left, 3)
+    trainer.run_step()  # the fit goes on with the others
+    assert trainer.state.bad_steps == 0
+    while light.count > 1:
+        light.used[torch.nonzero(light.used)[0, 0]] = False
+    assert keep_bright_lamps(trainer.field, trainer.measurements, sampling, 0) == 1  # the last one stays: the decision is about it

@@ -181,4 +181,5 @@ def test_an_edge_is_two_surfaces(way: str, row: Row) -> None:
     mean = share * ball + hits.share.detach()[hits.behind] * wall
     off = float(torch.minimum((mean - ball).abs(), (mean - wall).abs()).max())
     assert off > 0.4
-    row("a pixel half on an edge", f"features of a place {off:.1f} radii from either surface", "those of both")
+    if way == "fused":
+        row("a pixel half on an edge", f"features of a place {off:.1f} radii from either surface", "those of both")
