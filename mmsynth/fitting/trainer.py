@@ -249,7 +249,9 @@ class Trainer:
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
             loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
-            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(self._gradients(hits, batch, slopes, sampling, generator))
+            below = recipe.loss.eikonal_below_early if self.progress < recipe.schedule.levels_until else 1.0
+            found = self._gradients(hits, batch, slopes, sampling, generator)
+            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(found, below)
         return loss, errors, int(hits.samples)
 
     @property
