@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
@@ -22,6 +23,7 @@ from mmsynth.fitting.recipe import RadianceRecipe
 
 DEGREES = 3  # of spherical harmonics
 _RAYS = 2048  # per modality, to judge, and half as many to learn from
+_SURE = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -42,16 +44,30 @@ def decide(field: Field, measurements: dict[str, Measurements], recipe: Radiance
     learned, judged = (look(field, measurements, rays, sampling, random) for rays in (_RAYS // 2, _RAYS))
     if recipe.view_dependence == "auto":
         errors = errors_by_degree(field.shader, learned, judged)
-        degrees = {name: _degree(errors[name], recipe.view_dependence_min_improvement) for name in measurements}
+        degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         asked = recipe.view_dependence
         degrees = dict.fromkeys(measurements, Choice(asked, f"degree {asked}: asked for by the recipe", asked > 0))
     return Decisions(degrees, _exposure(field, judged, measurements, recipe))
 
 
-def _degree(errors: list[float], worth: float) -> Choice[int]:
-    degree, best = degree_needed(errors, worth), errors[-1]
-    grown = ", ".join(f"{e / best - 1:+.1%}" for e in errors[:-1]) if best > 0 else "nothing that could be told apart"
+def choose_degrees(errors: dict[str, Tensor], worth: float) -> dict[str, Choice[int]]:
+    """Each modality's degree: what its own errors ask for, and what those of all together do.
+
+    Sensors see one scene. By its own errors alone a noisier one now and then falls a little short of what the others clearly need.
+
+    Args:
+        errors: by modality, as ``errors_by_degree`` returns them.
+    """
+    relative = [own / own[-1].mean() for own in errors.values() if bool(own[-1].mean() > 0)]
+    together = degree_needed(torch.cat(relative, 1), worth) if relative else 0
+    return {name: _degree(own, max(degree_needed(own, worth), together)) for name, own in errors.items()}
+
+
+def _degree(errors: Tensor, degree: int) -> Choice[int]:
+    means = errors.mean(1).tolist()
+    best = means[-1]
+    grown = ", ".join(f"{e / best - 1:+.1%}" for e in means[:-1]) if best > 0 else "nothing that could be told apart"
     return Choice(degree, f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}", degree > 0)
 
 
@@ -73,20 +89,25 @@ def _exposure(field: Field, judged: Look, measurements: dict[str, Measurements],
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
-def errors_by_degree(shader: Shader, learned: Look, judged: Look) -> dict[str, list[float]]:
-    """Mean squared error of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
+def errors_by_degree(shader: Shader, learned: Look, judged: Look) -> dict[str, Tensor]:
+    """Squared errors of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
 
     Returns:
-        by modality; NaN where every number is clipped.
+        by modality, (DEGREES + 1, N); N = 0 where every number is clipped.
     """
-    squared = [squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)]
+    squared = torch.stack([squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)])
     parts = judged.batch.parts.items()
-    return {name: [float(errors[numbers][judged.usable[numbers]].mean()) for errors in squared] for name, (_, numbers) in parts}
+    return {name: squared[:, numbers][:, judged.usable[numbers]] for name, (_, numbers) in parts}
 
 
-def degree_needed(errors: list[float], worth: float) -> int:
-    """The lowest degree whose error is within ``worth`` (a share) of the best; 0 where nothing could be judged and errors are NaN."""
-    return next((degree for degree, error in enumerate(errors) if error <= (1.0 + worth) * min(errors)), 0)
+def degree_needed(errors: Tensor, worth: float) -> int:
+    """The lowest degree whose mean error is within ``worth`` (a share) or two standard errors of the best, from errors (degrees, N) at the
+    same N numbers; 0 where there are none."""
+    means = errors.mean(1)
+    best = int(means.argmin())
+    more = errors - errors[best]
+    allowed = torch.maximum(worth * means[best], _SURE * more.std(1, correction=0) / max(errors.shape[1], 1) ** 0.5)
+    return next((degree for degree in range(len(errors)) if more[degree].mean() <= allowed[degree]), 0)
 
 
 def exposure_spread(predicted: np.ndarray, target: np.ndarray, frame: np.ndarray) -> tuple[float, float]:

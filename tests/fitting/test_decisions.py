@@ -7,7 +7,7 @@ import torch
 from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.candidates import Look
-from mmsynth.fitting.decisions import DEGREES, degree_needed, errors_by_degree, exposure_spread
+from mmsynth.fitting.decisions import DEGREES, choose_degrees, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
 
@@ -75,7 +75,35 @@ def test_the_degree_that_light_has_is_found(needed: int) -> None:
     assert all(bool((p == q).all()) for p, q in zip(shader.parameters(), before, strict=True))  # copies learned, not the shader
 
 
+def _errors(*means: float, numbers: int = 2000, noise: float = 0.0) -> torch.Tensor:
+    """(4, numbers), with these means; those of lower degrees differ from the last ones' by as much noise at each number."""
+    last = torch.full((numbers,), means[-1])
+    return torch.stack([last + (m - means[-1]) + noise * torch.randn(numbers) * (m != means[-1]) for m in means])
+
+
+def test_a_noisy_sensor_sees_the_same_scene_as_the_others() -> None:
+    torch.manual_seed(0)
+    clear, unclear, flat, none = (
+        _errors(2.0, 1.9, 1.5, 1.0),
+        _errors(1.3, 1.2, 1.04, 1.0),
+        _errors(1.0, 1.01, 1.02, 1.02),
+        torch.empty(4, 0),
+    )
+    degrees = lambda **errors: {name: choice.value for name, choice in choose_degrees(errors, worth=0.05).items()}
+    assert degrees(pol=unclear) == {"pol": 2}
+    assert degrees(rgb=clear, ms=clear, pol=unclear, nir=none) == {"rgb": 3, "ms": 3, "pol": 3, "nir": 3}
+    assert degrees(rgb=flat, ms=flat, pol=_errors(1.2, 1.1, 1.0, 1.01)) == {"rgb": 1, "ms": 1, "pol": 2}
+    assert degrees(rgb=flat) == {"rgb": 0} and degrees(rgb=none) == {"rgb": 0}
+
+
 def test_degree_needed_is_the_lowest_of_the_good_ones() -> None:
-    assert degree_needed([1.05, 1.02, 1.0, 1.01], worth=0.1) == 0
-    assert degree_needed([2.0, 1.05, 1.0, 1.01], worth=0.1) == 1
-    assert degree_needed([2.0, 1.9, 1.5, 1.0], worth=0.1) == 3
+    assert degree_needed(_errors(1.05, 1.02, 1.0, 1.01), worth=0.1) == 0
+    assert degree_needed(_errors(2.0, 1.05, 1.0, 1.01), worth=0.1) == 1
+    assert degree_needed(_errors(2.0, 1.9, 1.5, 1.0), worth=0.1) == 3
+
+
+def test_a_difference_that_chance_makes_needs_no_degree() -> None:
+    torch.manual_seed(1)
+    few, many = (_errors(1.2, 1.2, 1.2, 1.0, numbers=n, noise=4.0) for n in (200, 200_000))
+    assert degree_needed(few, worth=0.05) == 0  # 0.2 +- 0.28
+    assert degree_needed(many, worth=0.05) == 3  # 0.2 +- 0.01
