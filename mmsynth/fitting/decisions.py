@@ -59,13 +59,13 @@ def choose_degrees(errors: dict[str, Tensor], worth: float) -> dict[str, Choice[
     Args:
         errors: by modality, as ``errors_by_degree`` returns them.
     """
-    relative = [own / own[-1].mean() for own in errors.values() if bool(own[-1].mean() > 0)]
+    relative = [own / own[-1].mean() for own in errors.values() if own.shape[1] and bool(own[-1].mean() > 0)]
     together = degree_needed(torch.cat(relative, 1), worth) if relative else 0
     return {name: _degree(own, max(degree_needed(own, worth), together)) for name, own in errors.items()}
 
 
 def _degree(errors: Tensor, degree: int) -> Choice[int]:
-    means = errors.mean(1).tolist()
+    means = errors.mean(1).tolist() if errors.shape[1] else [0.0]
     best = means[-1]
     grown = ", ".join(f"{e / best - 1:+.1%}" for e in means[:-1]) if best > 0 else "nothing that could be told apart"
     return Choice(degree, f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}", degree > 0)
@@ -103,10 +103,12 @@ def errors_by_degree(shader: Shader, learned: Look, judged: Look) -> dict[str, T
 def degree_needed(errors: Tensor, worth: float) -> int:
     """The lowest degree whose mean error is within ``worth`` (a share) or two standard errors of the best, from errors (degrees, N) at the
     same N numbers; 0 where there are none."""
+    if not errors.shape[1]:
+        return 0
     means = errors.mean(1)
     best = int(means.argmin())
     more = errors - errors[best]
-    allowed = torch.maximum(worth * means[best], _SURE * more.std(1, correction=0) / max(errors.shape[1], 1) ** 0.5)
+    allowed = torch.maximum(worth * means[best], _SURE * more.std(1, correction=0) / errors.shape[1] ** 0.5)
     return next((degree for degree in range(len(errors)) if more[degree].mean() <= allowed[degree]), 0)
 
 
