@@ -144,8 +144,11 @@ class LossRecipe(_Section):
     """Terms beside the photometric loss, which has weight 1."""
 
     eikonal_weight: float = _key(0.1, "Weight of (|∇sdf| - 1)², the pull towards a true distance [1].", ge=0)
-    eikonal_below_early: float = _key(
-        0.1, "Factor of slopes below 1 in it until all levels are active [1]: narrow gaps have them, and stay open.", ge=0, le=1
+    eikonal_shallow_early: float = _key(
+        0.1,
+        "Factor of slopes below 1 in it, in the region, until all levels are active [1]: in gaps they are so, and these stay open.",
+        ge=0,
+        le=1,
     )
     eikonal_points: int = _key(1024, "Points of a step that are asked for it [points].", ge=8)
     background_opacity_weight: float = _key(1.0, "Weight of opacity on black pixels of a scene whose background is black [1].", ge=0)

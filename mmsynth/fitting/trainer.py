@@ -249,9 +249,8 @@ class Trainer:
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
             loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
-            below = recipe.loss.eikonal_below_early if self.progress < recipe.schedule.levels_until else 1.0
             found = self._gradients(hits, batch, slopes, sampling, generator)
-            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(found, below)
+            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(*found)
         return loss, errors, int(hits.samples)
 
     @property
@@ -300,9 +299,9 @@ class Trainer:
 
     def _gradients(
         self, hits: kernels.Hits, batch: Batch, slopes: torch.Tensor | None, sampling: kernels.Sampling, generator: torch.Generator
-    ) -> torch.Tensor:
-        """∇sdf at some points of the whole region, and at what was hit: ``slopes`` where they are known, else around some of the hits,
-        within the soft surface."""
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """∇sdf at some points of all space, and at what was hit: ``slopes`` where they are known, else around some of the hits, within
+        the soft surface; and the factors where it is below 1."""
         count = self.recipe.loss.eikonal_points
         surface = self.field.surface
         points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * surface.grid.extent).to(self.device)]
@@ -310,10 +309,14 @@ class Trainer:
         if slopes is None and len(hit):
             chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
             noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
-            at = batch.origins[chosen] + batch.directions[chosen] * hits.depth[chosen, None]
-            points.append(surface.grid.to_grid(at) + noise)
-        found = surface.gradient(torch.cat(points), surface.grid.cell(sampling.active_surface), sampling.active_surface)
-        return found if slopes is None else torch.cat([found, slopes])
+            met = batch.origins[chosen] + batch.directions[chosen] * hits.depth[chosen, None]
+            points.append(surface.grid.to_grid(met) + noise)
+        at = torch.cat(points)
+        found, shallow = surface.gradient(at, surface.grid.cell(sampling.active_surface), sampling.active_surface), at.new_ones(len(at))
+        if self.progress < self.recipe.schedule.levels_until:
+            # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
+            shallow[torch.linalg.vector_norm(at, dim=-1) < 1.0] = self.recipe.loss.eikonal_shallow_early
+        return (found, shallow) if slopes is None else (torch.cat([found, slopes]), torch.cat([shallow, at.new_ones(len(slopes))]))
 
     def _skip(self, reason: str) -> None:
         self.state.step += 1

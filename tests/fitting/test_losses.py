@@ -233,8 +233,8 @@ def test_eikonal_is_zero_for_distances_alone() -> None:
     units = torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
     assert float(eikonal(units)) < 1e-12
     assert float(eikonal(torch.tensor([[3.0, 0.0, 4.0], [0.0, 1.0, 0.0]]))) == pytest.approx(8.0)
-    slopes = torch.tensor([[0.5, 0.0, 0.0], [0.0, 1.5, 0.0]])
-    assert float(eikonal(slopes, below=0.1)) == pytest.approx(0.5 * (0.1 + 1.0) * 0.25)
+    slopes = torch.tensor([[0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 1.5, 0.0]])
+    assert float(eikonal(slopes, torch.tensor([0.1, 1.0, 0.1]))) == pytest.approx((0.1 + 1.0 + 1.0) / 3 * 0.25)
 
 
 def test_integers_stay_integers_in_memory(tmp_path: Path) -> None:
