@@ -120,7 +120,7 @@ class ScheduleRecipe(_Section):
     light_until: float = _key(0.45, "Progress at which residuals decide whether that is needed [progress].", ge=0, le=1)
     decide_at: float = _key(0.6, "Progress at which residuals decide on view dependence and exposure [progress].", ge=0, le=1)
     learning_rate_grid: float = _key(2e-2, "Adam's rate of the hash tables [1/step].", gt=0)
-    learning_rate_network: float = _key(8e-3, "Adam's rate of the networks [1/step].", gt=0)
+    learning_rate_network: float = _key(4e-3, "Adam's rate of the networks [1/step].", gt=0)
     learning_rate_exposure: float = _key(1e-3, "Adam's rate of the log exposures [1/step].", gt=0)
     learning_rate_end_factor: float = _key(0.5, "All rates at the end [rate after the start].", gt=0, le=1)
     full_rate_sharpness: float = _key(
@@ -145,7 +145,7 @@ class LossRecipe(_Section):
 
     eikonal_weight: float = _key(0.1, "Weight of (|∇sdf| - 1)², the pull towards a true distance [1].", ge=0)
     eikonal_shallow_early: float = _key(
-        0.1,
+        0.3,
         "Factor of slopes below 1 in it, in the region, until all levels are active [1]: in gaps they are so, and these stay open.",
         ge=0,
         le=1,
