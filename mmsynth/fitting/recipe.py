@@ -121,6 +121,7 @@ class ScheduleRecipe(_Section):
     decide_at: float = _key(0.6, "Progress at which residuals decide on view dependence and exposure [progress].", ge=0, le=1)
     learning_rate_grid: float = _key(2e-2, "Adam's rate of the hash tables [1/step].", gt=0)
     learning_rate_network: float = _key(4e-3, "Adam's rate of the networks [1/step].", gt=0)
+    learning_rate_light: float = _key(8e-3, "Adam's rate of the lamps and of how surfaces mirror them [1/step].", gt=0)
     learning_rate_exposure: float = _key(1e-3, "Adam's rate of the log exposures [1/step].", gt=0)
     learning_rate_end_factor: float = _key(0.5, "All rates at the end [rate after the start].", gt=0, le=1)
     full_rate_sharpness: float = _key(

@@ -91,8 +91,10 @@ class Trainer:
         self.log_gain = torch.nn.Parameter(torch.zeros(frames, device=self.device))
         parameters = {**dict(self.field.named_parameters()), _GAINS: self.log_gain}
         tables = {n for n in parameters if n.endswith(".table")}
-        rates = {n: recipe.schedule.learning_rate_grid if n in tables else recipe.schedule.learning_rate_network for n in parameters}
-        rates[_GAINS] = recipe.schedule.learning_rate_exposure
+        schedule = recipe.schedule
+        of_lamps = {n for n in parameters if n.startswith("light.")}
+        rates = {n: schedule.learning_rate_light if n in of_lamps else schedule.learning_rate_network for n in parameters}
+        rates |= {**dict.fromkeys(tables, schedule.learning_rate_grid), _GAINS: schedule.learning_rate_exposure}
         self.optimiser = Adam(parameters, rates)
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
