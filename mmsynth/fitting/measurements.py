@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
+from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.pixels import Pixels
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.masks import read_mask
@@ -29,6 +31,8 @@ class Batch:
         frame: (M,) int64, counted through the modalities in the order of ``parts``.
         parts: per modality its rays and its numbers.
         alpha: (R,) opacity to match, NaN = none.
+        ray_weight: (R,), as rays were drawn more or less often than evenly; within ``measured.weight``, too.
+        pixels: of each modality, which of its ``Measurements.pixels`` its rays are.
     """
 
     origins: Tensor
@@ -37,6 +41,8 @@ class Batch:
     frame: Tensor
     parts: dict[str, tuple[slice, slice]]
     alpha: Tensor
+    ray_weight: Tensor
+    pixels: dict[str, np.ndarray]
 
     def per_ray(self, values: Mapping[str, float]) -> Tensor:
         """A value for each modality → one for each ray, (R,)."""
@@ -137,19 +143,26 @@ def draw(
     rays: dict[str, int],
     random: np.random.Generator,
     device: torch.device,
+    importance: Importance | None = None,
 ) -> Batch:
     """A random batch.
 
     Args:
-        columns: the shader outputs of each modality. rays: how many of each modality.
+        columns: the shader outputs of each modality. rays: how many of each modality. importance: how often to draw each pixel, all
+            alike when None.
     """
     order = in_order(measurements)
     parts: dict[str, tuple[slice, slice]] = {}
     lists: dict[str, list[np.ndarray]] = {"axes": [np.empty((0, 3), np.float32)]}
+    numbers: dict[str, np.ndarray] = {}
     r_end = m_end = frames = 0
     for name in order:
         m, count = measurements[name], rays[name]
-        frame, pixel = m.pick(count, random)
+        if importance is None:
+            numbers[name], weight = random.integers(0, m.pixels.size, count), np.ones(count, np.float32)
+        else:
+            numbers[name], weight = importance.draw(name, count, random)
+        frame, pixel = m.pixels.at(numbers[name])
         origins, directions = m.rays(frame, pixel)
         target, alpha = m.read(frame, pixel)
         channel = m.measured(frame, pixel)
@@ -165,7 +178,7 @@ def draw(
             output = columns[name].start + channel
         else:
             output = np.tile(np.arange(columns[name].start, columns[name].stop), count)
-        of_all = {"level": m.radiance_scale, "saturation": m.sensor.saturation, "weight": 1.0 / (len(order) * target.size)}
+        of_all = {"level": m.radiance_scale, "saturation": m.sensor.saturation}
         drawn = {
             "origins": origins,
             "directions": directions,
@@ -173,6 +186,8 @@ def draw(
             "ray": np.repeat(np.arange(r_end, r_end + count), values),
             "output": output,
             "frame": np.repeat(frame + frames, values),
+            "weight": np.repeat(weight / np.float32(len(order) * target.size), values),
+            "ray_weight": weight,
             "alpha": np.full(count, np.nan if m.empty is None else 1.0, np.float32) if alpha is None else alpha,
             **{key: np.full(target.size, value, np.float32) for key, value in of_all.items()},
         }
@@ -182,7 +197,7 @@ def draw(
         r_end, m_end, frames = r_end + count, m_end + target.size, frames + len(m.origins)
     joined = {key: torch.from_numpy(np.concatenate(values)).to(device) for key, values in lists.items()}
     measured = kernels.Measured(*(joined.pop(key) for key in kernels.Measured._fields))
-    return Batch(**joined, measured=measured, parts=parts)
+    return Batch(**joined, measured=measured, parts=parts, pixels=numbers)
 
 
 def draw_empty(
@@ -216,6 +231,18 @@ def load_measurements(scene: Scene) -> dict[str, Measurements]:
     if not out:
         raise InputError(f"{scene.root}: no modality has a training frame.")
     return out
+
+
+def fingerprint(measurements: Mapping[str, Measurements]) -> str:
+    """Hash of the pixels that are learned from, and of their poses."""
+    digest = hashlib.sha256()
+    for name, m in measurements.items():
+        digest.update(name.encode())
+        for part in (m.origins, m.rotations, m.values):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        for chosen in (m.pixels, m.empty) if m.masked else ():
+            digest.update(b"" if chosen is None or chosen.bits is None else chosen.bits.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _inside(frames: tuple[Frame, ...], valid: list[np.ndarray], masks: MaskMeaning) -> tuple[Pixels, Pixels | None]:

@@ -82,6 +82,9 @@ class SamplingRecipe(_Section):
 
     samples_per_step: int = _key(16384, "Surface samples of an optimiser step [samples]; the number of rays follows.", ge=256)
     initial_rays: int = _key(256, "Rays of the first step [rays].", ge=1)
+    evenly: float = _key(
+        0.5, "Share of the rays that are drawn evenly from all pixels [1]; the others go where residuals are large.", gt=0, le=1
+    )
     sparse_below: float = _key(
         0.3,
         "Share of the most plentiful modality's pixels [1] below which a modality is sparse: it gets fewer rays, and learns its "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
@@ -19,8 +18,9 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import losses
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
+from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
-from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, in_order, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, in_order, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
@@ -28,12 +28,13 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
 
 _GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
 _OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (measured on one scene)
+_RENEW_EVERY = 16  # steps: where rays go
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
 
 
@@ -102,6 +103,7 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
+        self.importance = Importance({n: m.pixels.size for n, m in self.measurements.items()}, recipe.sampling.evenly)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
         self.has_empty = any(m.empty is not None for m in self.measurements.values())
         self.parts: dict[str, Any] = {
@@ -109,6 +111,7 @@ class Trainer:
             "optimiser": self.optimiser,
             "average": self.average,
             "refinement": self.refinement,
+            "importance": self.importance,
         }
 
     @property
@@ -138,7 +141,7 @@ class Trainer:
         sampling = sampling_at(self.progress, self.recipe, self.needs)
         self._prepare(sampling, generator)
         batch = self._draw(random)
-        loss, errors, samples = self._loss(batch, sampling, generator)
+        loss, squared, samples = self._loss(batch, sampling, generator)
         if self.has_empty:
             opacity, more = self._opacity_outside(random, sampling, generator)
             loss, samples = loss + self.recipe.loss.alpha_weight * opacity.square().mean(), samples + more
@@ -148,9 +151,9 @@ class Trainer:
             return
         self._update(sampling)
         keep = 0.98 if state.step else 0.0
-        value = float(loss.detach())
-        state.mean_loss = value if math.isnan(state.mean_loss) else keep * state.mean_loss + (1 - keep) * value  # nan: all were skipped
-        for name, error in errors.items():
+        value, before = float(loss.detach()), state.mean_loss
+        state.mean_loss = value if math.isnan(before) else keep * before + (1 - keep) * value  # nan: all were skipped
+        for name, error in self._errors(batch, squared).items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(batch.origins)
         state.samples_total += samples
@@ -160,13 +163,15 @@ class Trainer:
         state.step += 1
 
     def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
-        """What is due before a step: the occupancy grid, the rows of the tables, what residuals decide, the poses."""
+        """What is due before a step: the occupancy grid, where rays go, the rows of the tables, what residuals decide, the poses."""
         state, schedule, field = self.state, self.recipe.schedule, self.field
         if state.step % self.recipe.sampling.occupancy_every == 0:
             share = 1.0 if state.step == 0 else 1 / 16
             sdf = lambda x: field.surface(x, sampling.active_surface)
             if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
                 state.reopened += 1
+        if state.step % _RENEW_EVERY == 0:
+            self.importance.renew()
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
             self._resize_tables(state.tables, generator)
@@ -189,7 +194,7 @@ class Trainer:
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
 
     def _draw(self, random: np.random.Generator) -> Batch:
-        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.device)
+        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.device, self.importance)
 
     def _rays(self) -> dict[str, int]:
         """Of a step, how many of each modality."""
@@ -229,7 +234,8 @@ class Trainer:
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, dict[str, float], int]:
+    def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor, int]:
+        """The loss, the squared residual of each number (M,), and the samples that they took."""
         recipe, field = self.recipe, self.field
         jitter = torch.rand(len(batch.origins), generator=generator).to(self.device)
         hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
@@ -242,18 +248,27 @@ class Trainer:
         rays = kernels.ShadedRays(shaded.features, shaded.share, shaded.behind, batch.directions, degrees, trains_geometry)
         light, slopes = self._mirrored(hits, batch, trains_geometry, sampling) if field.shines else (None, None)
         loss, squared = kernels.compare(field.shader.weights(), rays, batch.measured, gain, light)
-        errors = {name: float(squared[numbers].mean()) for name, (_, numbers) in batch.parts.items()}
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)
-            loss = loss + recipe.loss.alpha_weight * (hits.opacity - batch.alpha)[known].square().sum() / len(jitter)
+            off = batch.ray_weight * (hits.opacity - batch.alpha).square()
+            loss = loss + recipe.loss.alpha_weight * off[known].sum() / len(jitter)
         elif self.needs.black_background:
             m = batch.measured
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
-            loss = loss + recipe.loss.background_opacity_weight * (hits.opacity * black).mean()
+            loss = loss + recipe.loss.background_opacity_weight * (batch.ray_weight * hits.opacity * black).mean()
         if recipe.loss.eikonal_weight > 0:
             found = self._gradients(hits, batch, slopes, sampling, generator)
             loss = loss + recipe.loss.eikonal_weight * losses.eikonal(*found)
-        return loss, errors, int(hits.samples)
+        return loss, squared, int(hits.samples)
+
+    def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
+        """Mean squared error of each modality; what residuals say of where to look is kept."""
+        out = {}
+        for name, (rays, numbers) in batch.parts.items():
+            found = squared[numbers].reshape(rays.stop - rays.start, -1).mean(1)
+            out[name] = float((batch.ray_weight[rays] * found).mean())
+            self.importance.learn(name, batch.pixels[name], (found.sqrt() / self.measurements[name].radiance_scale).cpu().numpy())
+        return out
 
     @property
     def _has_gains(self) -> bool:
@@ -371,29 +386,10 @@ class Trainer:
 
     def _task(self) -> dict[str, Any]:
         """What a checkpoint must agree on to be resumed: hash of the pixels and poses, recipe, seed, length."""
-        digest = hashlib.sha256()
-        for name, m in self.measurements.items():
-            digest.update(name.encode())
-            for part in (m.origins, m.rotations, m.values):
-                digest.update(np.ascontiguousarray(part).tobytes())
-            for chosen in (m.pixels, m.empty) if m.masked else ():
-                digest.update(b"" if chosen is None or chosen.bits is None else chosen.bits.tobytes())
         return {
-            "scene": digest.hexdigest()[:16],
+            "scene": fingerprint(self.measurements),
             "recipe": json.dumps(self.recipe.model_dump(), sort_keys=True),
             "seed": self.seed,
             "steps": self.steps or 0,
             "budget": self.budget or 0.0,
         }
-
-
-def rig_of(scene: Scene) -> dict[str, np.ndarray]:
-    """sensor → (4, 4) sensor_to_reference, from the first view that both saw; sensors that never shared a view are left out."""
-    reference = next(iter(scene.sensors))
-    poses = {f.view: f.camera_to_world for f in scene.frames_of(reference)}
-    rig = {reference: np.eye(4)}
-    for name in scene.sensors:
-        for frame in scene.frames_of(name):
-            if frame.view in poses:
-                rig.setdefault(name, np.linalg.inv(poses[frame.view]) @ frame.camera_to_world)
-    return rig

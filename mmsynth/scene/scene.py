@@ -230,3 +230,15 @@ def keep_frames(scene: Scene, limits: Mapping[str, int]) -> Scene:
         kept = {views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)} if count < len(views) else set(views)
         dropped |= {(name, view) for view in views if view not in kept}
     return replace(scene, frames=tuple(f for f in scene.frames if (f.sensor, f.view) not in dropped))
+
+
+def rig_of(scene: Scene) -> dict[str, np.ndarray]:
+    """sensor → (4, 4) sensor_to_reference, from the first view that both saw; sensors that never shared a view are left out."""
+    reference = next(iter(scene.sensors))
+    poses = {f.view: f.camera_to_world for f in scene.frames_of(reference)}
+    rig = {reference: np.eye(4)}
+    for name in scene.sensors:
+        for frame in scene.frames_of(name):
+            if frame.view in poses:
+                rig.setdefault(name, np.linalg.inv(poses[frame.view]) @ frame.camera_to_world)
+    return rig

@@ -28,17 +28,17 @@ from mmsynth.fitting.measurements import draw, load_measurements
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
-from mmsynth.fitting.trainer import FitProgress, Trainer, rig_of
+from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.packaged import data_folder
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
+from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, rig_of
 from mmsynth.sensors.camera import Camera, ray_map
 
 # every number that a result here depends on: the defaults are tuned from time to time
 SMALL = Recipe().with_changes({
-    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "surface.levels": 4, "surface.max_rows_log2": 12,
+    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "sampling.evenly": 0.5, "surface.levels": 4, "surface.max_rows_log2": 12,
     "radiance.levels": 4, "radiance.max_rows_log2": 12, "surface.cells_per_pixel": 0.5, "radiance.cells_per_pixel": 1.0,
     "surface.hidden_width": 32, "radiance.hidden_width": 64, "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 16,
     "surface.initial_radius": 0.3, "surface.outer_radius": 1.8, "schedule.sharpness_start": 20.0, "schedule.sharpness_per_footprint": 4.0,
