@@ -48,11 +48,13 @@ class Light(nn.Module):
         """How many lamps there are, K."""
         return int(self.used.sum())
 
-    def put(self, positions: Tensor) -> None:
-        """Lamps as bright as the scene, at (K, 3)."""
+    def add(self, positions: Tensor) -> None:
+        """Lamps as bright as the scene, seen from all surfaces, at (K, 3), in the first K free places."""
+        free = torch.nonzero(~self.used)[: len(positions), 0]
         with torch.no_grad():
-            self.position[: len(positions)] = positions
-            self.used.copy_(torch.arange(LAMPS) < len(positions))
+            self.position[free], self.log_spectrum[free] = positions, 0.0
+            self.second.weight[len(_START) + free], self.second.bias[len(_START) + free] = 0.0, _VISIBLE
+            self.used[free] = True
 
     def material(self, features: Tensor) -> Tensor:
         """What surfaces do with the lamps, (H, F) → (H, 5 + K): see ``kernels.mirroring.material``."""
@@ -97,27 +99,32 @@ _LEAST_VOTE = 0.3  # of the best direction's
 _PRIOR = 0.25  # votes without light that every direction has beside its own, of the most that any has
 
 
-def find_lamps(reflected: Tensor, light: Tensor) -> Tensor:
+def find_lamps(reflected: Tensor, light: Tensor, missing: Tensor | None = None, known: Tensor | None = None) -> Tensor:
     """Directions (K, 3) of lamps: where mirrored rays that are brighter than their surface go.
 
     Args:
         reflected: (N, 3) directions of rays after the mirror. light: (N,) ≥ 0, what they saw beyond the surface's own.
+        missing: (N,) ≥ 0, what of it is not yet explained, by lamps in the directions ``known`` (L, 3), unit: others are looked for in it,
+            and must be as bright beside the brightest of all ``light`` as without it.
     """
-    if not bool((light > 0).any()):
+    missing, known = light if missing is None else missing, reflected[:0] if known is None else known
+    if not bool((missing > 0).any()):
         return reflected[:0]
     i = torch.arange(_DIRECTIONS, dtype=torch.float32, device=light.device) + 0.5
     z = 1.0 - 2.0 * i / _DIRECTIONS
     turn, radius = math.pi * (1.0 + math.sqrt(5.0)) * i, torch.sqrt(1.0 - z * z)
     sphere = torch.stack([radius * torch.cos(turn), radius * torch.sin(turn), z], -1)  # Fibonacci's
-    bright, rays = torch.zeros_like(z), torch.zeros_like(z)
-    for part, weight in zip(reflected.split(8192), light.split(8192), strict=True):
+    bright, rays = z.new_zeros(2, _DIRECTIONS), torch.zeros_like(z)
+    for part, weight in zip(reflected.split(8192), torch.stack([light, missing], 1).split(8192), strict=True):
         votes = torch.exp(_CONCENTRATION * (part @ sphere.T - 1.0))
-        bright, rays = bright + weight @ votes, rays + votes.sum(0)
-    score = bright / (rays + _PRIOR * rays.max())
-    least = _LEAST_VOTE * score.max()
+        bright, rays = bright + weight.T @ votes, rays + votes.sum(0)
+    whole, score = bright / (rays + _PRIOR * rays.max())
+    least = _LEAST_VOTE * whole.max()
+    near = (sphere @ known.T > _APART).any(1)
     found: list[Tensor] = []
-    while len(found) < LAMPS and bool(score.max() > least):
-        best = sphere[score.argmax()]
-        found.append(best)
-        score = score.masked_fill(sphere @ best > _APART, 0.0)
-    return torch.stack(found)
+    while True:
+        score = score.masked_fill(near, 0.0)
+        if len(known) + len(found) == LAMPS or not bool(score.max() > least):
+            return torch.stack(found) if found else reflected[:0]
+        found.append(sphere[score.argmax()])
+        near = sphere @ found[-1] > _APART

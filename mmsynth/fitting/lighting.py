@@ -49,24 +49,32 @@ def _look(field: Field, measurements: dict[str, Measurements], sampling: kernels
 
 @torch.no_grad()
 def look_for_lamps(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> int:
-    """Put lamps into a field's light where mirrored rays are brighter than their surfaces: how many.
+    """Put lamps into a field's light where mirrored rays are brighter than their surfaces, and than its lamps so far make them: how many.
 
     The directions are those of ``find_lamps``, the distance is a guess that the fit improves.
     """
-    if field.light is None:
+    light = field.light
+    if light is None:
         return 0
     look = _look(field, measurements, sampling, seed)
-    hits, m, rays = look.hits, look.batch.measured, len(look.batch.origins)
-    degrees = look.batch.per_ray(field.view_dependence)[kernels.rays_of(hits.behind)]
-    outputs = field.shader(hits.features, look.directions, degrees)
-    more = (m.target - kernels.predict(outputs, hits.share, m, hits.behind)) / m.level
-    # a lamp is brighter in every number of a ray
-    least = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, more, "amin", include_self=False).clamp(0.0, _BRIGHTEST)
+    batch, hits, rays = look.batch, look.hits, len(look.batch.origins)
+    m = batch.measured
+    # what the shader paints for some directions alone may be a lamp's, too
+    paint = kernels.predict(field.shader(hits.features, look.directions, 0), hits.share, m, hits.behind)
+    seen = field.mirrored(hits, batch.origins, batch.directions, m, sampling.active_surface)
     chosen = (hits.share[:rays] > 0.5) & (torch.linalg.vector_norm(look.points[:rays], dim=-1) < 1.0)
-    d, n = look.batch.directions[chosen], look.normals[:rays][chosen]
-    lamps = find_lamps(d - 2.0 * (d * n).sum(-1, keepdim=True) * n, least[chosen])
+
+    def least(more: Tensor) -> Tensor:
+        """A lamp is brighter in every number of a ray."""
+        of_rays = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, more / m.level, "amin", include_self=False)
+        return of_rays.clamp(0.0, _BRIGHTEST)[chosen]
+
+    d, n = batch.directions[chosen], look.normals[:rays][chosen]
+    reflected, known = d - 2.0 * (d * n).sum(-1, keepdim=True) * n, light.position[light.used]
+    distance = torch.linalg.vector_norm(known, dim=-1, keepdim=True)
+    lamps = find_lamps(reflected, least(m.target - paint), least(m.target - paint - seen), known / distance)
     cameras = np.concatenate([np.linalg.norm(m.origins, axis=1) for m in measurements.values()])
-    field.light.put(lamps * _FARTHER * max(float(np.median(cameras)), 1.0))
+    light.add(lamps * (float(distance.mean()) if len(known) else _FARTHER * max(float(np.median(cameras)), 1.0)))
     return len(lamps)
 
 

@@ -181,6 +181,8 @@ class Trainer:
         if state.light is None and (self.progress >= schedule.light_until or (state.lamps_sought and not field.shines)):
             state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed)
             self._mirror(state.light)
+            if field.shines:  # by now some are found, and surfaces are in better shape than when these were looked for
+                look_for_lamps(field, self.measurements, sampling, self.seed)
         if state.decided is None:
             # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
             seen = 0 if self.progress < schedule.view_dependence_from else DEGREES

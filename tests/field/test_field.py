@@ -169,7 +169,7 @@ def test_what_is_rendered_of_lamps_is_what_a_fit_compares() -> None:
     field.light = Light(field.appearance.width, field.shader.heads.out_features)
     origins, directions, out = _look_around(field, 200)
     assert all(torch.equal(out[name].nan_to_num(), plain[name].nan_to_num()) for name in plain)  # there are no lamps yet
-    field.light.put(torch.tensor([[0.0, 0.0, 3.0], [2.0, 2.0, -1.0]]))
+    field.light.add(torch.tensor([[0.0, 0.0, 3.0], [2.0, 2.0, -1.0]]))
     origins, directions, out = _look_around(field, 200)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((200,), 0.5), field.sampling)
     ray = torch.arange(200)
@@ -191,7 +191,7 @@ def test_a_saved_field_is_the_same_field(tmp_path: Path, background: bool, lit: 
     if lit:
         field.design = dataclasses.replace(field.design, light=True)
         field.light = Light(field.appearance.width, field.shader.heads.out_features)
-        field.light.put(torch.ones(2, 3))
+        field.light.add(torch.ones(2, 3))
     field.view_dependence.update({"rgb": 0, "pol": 1, "nir": 3})
     field.occupancy.states[3, 4, 5] = 17
     field.sensors["nir"] = replace(NIR, saturation=float("inf"), mosaic=np.array([[0]]))
@@ -258,7 +258,7 @@ def test_what_is_mirrored_and_the_rest_is_all_light(background: bool) -> None:
     with pytest.raises(InputError, match="no lamps"):
         render_light(field, camera, pose)
     field.light = Light(field.appearance.width, field.shader.heads.out_features)
-    field.light.put(torch.tensor([[0.0, 0.0, -3.0], [2.0, 2.0, -1.0]]))
+    field.light.add(torch.tensor([[0.0, 0.0, -3.0], [2.0, 2.0, -1.0]]))
     lit = field.render(camera, pose)
     with torch.no_grad():
         field.light.second.bias[2:4] = -60.0  # nothing of the surroundings, nothing transmitted

@@ -161,9 +161,40 @@ def test_lamps_are_found_where_mirrored_rays_are_bright() -> None:
     assert len(find_lamps(reflected, torch.zeros(20000))) == 0
 
 
+def test_a_lamp_that_was_missed_is_found_beside_those_that_are_known() -> None:
+    g = torch.Generator().manual_seed(4)
+    true = normalize(torch.tensor([[0.5, 0.4, 0.8], [-0.7, 0.2, 0.6], [0.1, -0.9, 0.4]]), dim=1)
+    reflected = normalize(torch.randn(20000, 3, generator=g), dim=1)
+    lobes = torch.exp(60.0 * (reflected @ true.T - 1.0))
+    noise = 0.05 * torch.rand(20000, generator=g)
+    found = find_lamps(reflected, lobes.sum(1) + noise, lobes[:, 2] + noise, true[:2])
+    assert len(found) == 1 and float(found[0] @ true[2]) > math.cos(math.radians(6.0))
+    # a known lamp that is too faint is not found twice, and what is left of all of them is no lamp
+    assert len(find_lamps(reflected, lobes.sum(1), 0.5 * lobes[:, :2].sum(1), true[:2])) == 0
+    assert len(find_lamps(reflected, lobes.sum(1), 0.2 * lobes.sum(1), true[:0])) == 0
+    everywhere = normalize(torch.randn(LAMPS, 3, generator=g), dim=1)
+    assert len(find_lamps(reflected, lobes.sum(1), lobes.sum(1), everywhere)) == 0  # there is no place for another
+
+
+def test_a_place_that_a_lamp_left_is_as_new() -> None:
+    light = Light(8, OUTPUTS)
+    light.add(torch.ones(2, 3))
+    with torch.no_grad():
+        light.log_spectrum.fill_(-5.0)
+        light.second.weight.fill_(1.0)
+        light.used[0] = False
+    light.add(torch.full((1, 3), 2.0))
+    assert light.used.tolist() == [True, True, *[False] * (LAMPS - 2)]
+    assert light.position[:2, 0].tolist() == [2.0, 1.0]
+    spectrum = light.log_spectrum.detach()
+    assert not spectrum[0].any() and bool((spectrum[1] == -5.0).all())
+    seen = torch.sigmoid(light.material(torch.randn(5, 8))[:, 5])
+    torch.testing.assert_close(seen, seen[:1].expand(5))
+
+
 def test_a_light_has_as_many_lamps_as_were_put() -> None:
     light = Light(8, OUTPUTS)
     assert light.material(torch.randn(5, 8)).shape == (5, 5) and light.lamps().spectrum.shape == (0, OUTPUTS)
-    light.put(torch.ones(2, 3))
+    light.add(torch.ones(2, 3))
     assert light.material(torch.randn(5, 8)).shape == (5, 7) and light.lamps().position.shape == (2, 3)
     assert torch.equal(light.lamps().spectrum, torch.ones(2, OUTPUTS))

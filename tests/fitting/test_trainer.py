@@ -38,7 +38,8 @@ from mmsynth.sensors.camera import Camera, ray_map
 
 # every number that a result here depends on: the defaults are tuned from time to time
 SMALL = Recipe().with_changes({
-    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "sampling.evenly": 0.5, "surface.levels": 4, "surface.max_rows_log2": 12,
+    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "sampling.evenly": 0.5,
+    "surface.levels": 4, "surface.max_rows_log2": 12,
     "radiance.levels": 4, "radiance.max_rows_log2": 12, "surface.cells_per_pixel": 0.5, "radiance.cells_per_pixel": 1.0,
     "surface.hidden_width": 32, "radiance.hidden_width": 64, "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 16,
     "surface.initial_radius": 0.3, "surface.outer_radius": 1.8, "schedule.sharpness_start": 20.0, "schedule.sharpness_per_footprint": 4.0,

@@ -247,7 +247,7 @@ def test_light_is_a_record_of_its_own(tmp_path: Path, file_format: Any) -> None:
     }
     field = Field(Design(light=True, **sizes), {s.name: s for s in (RGB, POL)}, {"rgb": 0.5, "pol": 0.2}, Region((0.0, 0.0, 0.0), 1.0))
     assert field.light is not None
-    field.light.put(torch.tensor([[0.0, 1.0, 4.0], [3.0, 0.0, 2.0]]))
+    field.light.add(torch.tensor([[0.0, 1.0, 4.0], [3.0, 0.0, 2.0]]))
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 2.0
     view = PosedCamera(Camera(24, 16, 20.0, 20.0, 11.5, 7.5), pose, "one")
