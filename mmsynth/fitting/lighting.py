@@ -51,11 +51,14 @@ def _look(field: Field, measurements: dict[str, Measurements], sampling: kernels
 def look_for_lamps(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> int:
     """Put lamps into a field's light where mirrored rays are brighter than their surfaces, and than its lamps so far make them: how many.
 
-    The directions are those of ``find_lamps``, the distance is a guess that the fit improves.
+    The directions are those of ``find_lamps``, the distance is a guess that the fit improves. Not for once: while surfaces are not yet
+    in shape, some are missed, and others seen where none are. So lamps of which next to nothing is seen are given up first.
     """
     light = field.light
     if light is None:
         return 0
+    if field.shines:
+        keep_bright_lamps(field, measurements, sampling, seed)
     look = _look(field, measurements, sampling, seed)
     batch, hits, rays = look.batch, look.hits, len(look.batch.origins)
     m = batch.measured

@@ -47,3 +47,12 @@ def learning_rate_factor(progress: float, recipe: Recipe) -> float:
     rise = min(1.0, progress / 0.01)
     fall = max(0.0, (progress - 0.33) / 0.67)
     return max(rise, 0.02) * math.exp(math.log(recipe.schedule.learning_rate_end_factor) * fall)
+
+
+_LOOKS = 3  # before it is decided whether lamps are needed
+
+
+def light_looks(progress: float, recipe: Recipe) -> int:
+    """How often lamps should have been looked for by now: evenly over the time in which they are tried."""
+    begin, end = recipe.schedule.light_at, recipe.schedule.light_until
+    return 0 if progress < begin else min(_LOOKS, 1 + int(_LOOKS * (progress - begin) / max(end - begin, 1e-9)))

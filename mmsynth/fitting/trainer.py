@@ -26,7 +26,7 @@ from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import learning_rate_factor, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
@@ -61,7 +61,7 @@ class _State:
     bad_steps: int = 0
     reopened: int = 0
     tables: TableSizes | None = None
-    lamps_sought: bool = False
+    light_looks: int = 0
     light: Choice[bool] | None = None
     decided: Decisions | None = None
     mean_loss: float = math.nan
@@ -175,14 +175,13 @@ class Trainer:
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
             self._resize_tables(state.tables, generator)
-        if not state.lamps_sought and self.progress >= schedule.light_at:
+        if state.light is None and state.light_looks < light_looks(self.progress, self.recipe):
             look_for_lamps(field, self.measurements, sampling, self.seed)
-            state.lamps_sought = True
-        if state.light is None and (self.progress >= schedule.light_until or (state.lamps_sought and not field.shines)):
+            state.light_looks += 1
+        if state.light is None and (self.progress >= schedule.light_until or (state.light_looks and not field.shines)):
             state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed)
             self._mirror(state.light)
-            if field.shines:  # by now some are found, and surfaces are in better shape than when these were looked for
-                look_for_lamps(field, self.measurements, sampling, self.seed)
+            look_for_lamps(field, self.measurements, sampling, self.seed)
         if state.decided is None:
             # a surface in the wrong place can be painted right for every view; it cannot while its colour has no direction
             seen = 0 if self.progress < schedule.view_dependence_from else DEGREES

@@ -48,9 +48,11 @@ def test_lamps_are_tried_and_then_decided_on(scene: Scene) -> None:
     news = []
     for _ in range(40):
         trainer.run_step()
-        news.append((trainer.state.lamps_sought, trainer.field.shines, trainer.state.light is not None))
+        news.append((trainer.state.light_looks, trainer.field.shines, trainer.state.light is not None))
+    looks, shines, decided = (list(column) for column in zip(*news, strict=True))
     # at 0.3 of 40 steps, and at 0.45
-    assert [sum(column) for column in zip(*news, strict=True)] == [28, 28, 22]
+    assert looks.index(1) == shines.index(True) == 12 and decided.index(True) == 18 and all(shines[12:])
+    assert [looks.count(n) > 0 for n in range(4)] == [True] * 4 and looks.index(3) < 18 and looks == sorted(looks)
     assert trainer.choices["light"].value and "asked for by the recipe" in trainer.choices["light"].why
     light = trainer.field.light
     assert light is not None and all(p.grad is not None for p in light.parameters())
