@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import torch
@@ -14,10 +15,14 @@ _EPSILON = 1e-15
 
 
 class Adam:
-    """Adam over named parameters. A step clears the gradients."""
+    """Adam over named parameters. A step clears the gradients.
 
-    def __init__(self, parameters: dict[str, nn.Parameter], rates: dict[str, float]) -> None:
-        self.parameters, self.rates = parameters, rates
+    Args:
+        sparse: names of those of which a step changes only what has a gradient, see ``kernels.adam``.
+    """
+
+    def __init__(self, parameters: dict[str, nn.Parameter], rates: dict[str, float], sparse: Collection[str] = ()) -> None:
+        self.parameters, self.rates, self.sparse = parameters, rates, sparse
         self.moments = {n: [torch.zeros_like(p), torch.zeros_like(p)] for n, p in parameters.items()}
         self.count = 0
 
@@ -34,7 +39,7 @@ class Adam:
                 rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
                 met = slice((rows or {}).get(name))
                 first, second = self.moments[name]
-                kernels.adam(p[met], p.grad[met], first[met], second[met], rate, *_BETAS, _EPSILON, self.count)
+                kernels.adam(p[met], p.grad[met], first[met], second[met], rate, *_BETAS, _EPSILON, self.count, name in self.sparse)
 
     def resize(self, name: str, kept: int) -> None:
         """Follow a parameter that has new rows behind its first ``kept``."""

@@ -96,7 +96,7 @@ class Trainer:
         of_lamps = {n for n in parameters if n.startswith("light.")}
         rates = {n: schedule.learning_rate_light if n in of_lamps else schedule.learning_rate_network for n in parameters}
         rates |= {**dict.fromkeys(tables, schedule.learning_rate_grid), _GAINS: schedule.learning_rate_exposure}
-        self.optimiser = Adam(parameters, rates)
+        self.optimiser = Adam(parameters, rates, sparse=tables)
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]

@@ -428,3 +428,46 @@ def test_adam_leaves_what_never_had_a_gradient() -> None:
         for count in (1, 2):
             kernels.adam(p, zero.clone(), first := zero.clone(), second := zero.clone(), 0.1, 0.9, 0.99, 1e-15, count)
         assert torch.equal(p, before) and not first.any() and not second.any()
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("rows", [7, 20_000])
+def test_sparse_adam_is_torchs(rows: int, dtype: torch.dtype, tolerance: float) -> None:
+    """Rows that a step did not meet stay as they are, and so do their moments."""
+    torch.manual_seed(1)
+    ours = torch.randn(rows, 4, dtype=dtype)
+    theirs = ours.double().requires_grad_()
+    optimiser = torch.optim.SparseAdam([theirs], lr=0.02, betas=(0.9, 0.99), eps=1e-15)
+    first, second = torch.zeros_like(ours), torch.zeros_like(ours)
+    for count in range(1, 12):
+        gradient = torch.randn(rows, 4, dtype=dtype) * 10.0 ** float(torch.randint(-6, 3, ()))
+        gradient[torch.rand(rows) < 0.7] = 0
+        met = torch.nonzero(gradient.any(1))[:, 0]
+        before = [x.clone() for x in (ours, first, second)]
+        theirs.grad = torch.sparse_coo_tensor(met[None], gradient[met].double(), ours.shape)
+        optimiser.step()
+        kernels.adam(ours, gradient, first, second, 0.02, 0.9, 0.99, 1e-15, count, sparse=True)
+        assert not gradient.any()
+        kept = torch.ones(rows, dtype=torch.bool).index_fill(0, met, False)
+        assert all(torch.equal(x[kept], old[kept]) for x, old in zip((ours, first, second), before, strict=True))
+        torch.testing.assert_close(ours.double(), theirs.detach(), atol=tolerance, rtol=0)
+
+
+def test_a_number_met_once_moves_by_about_the_rate() -> None:
+    """Its moments would carry it on for ten times as far while other numbers learn."""
+    moved = []
+    for sparse in (False, True):
+        p, first, second = torch.zeros(3, 1)
+        for count in range(1, 200):
+            gradient = torch.full((1,), 2.5 if count == 50 else 0.0)
+            kernels.adam(p, gradient, first, second, 0.01, 0.9, 0.99, 1e-15, count, sparse)
+        moved.append(-float(p))
+    assert moved[0] > 0.06 and moved[1] == pytest.approx(0.01, rel=0.4)
+
+
+def test_a_gradient_that_is_not_a_number_is_not_passed_over() -> None:
+    for dtype in (torch.float32, torch.float64):
+        p, first, second = torch.zeros(3, 5, dtype=dtype)
+        gradient = torch.tensor([0.0, float("nan"), 1.0, 0.0, -1.0], dtype=dtype)
+        kernels.adam(p, gradient, first, second, 0.01, 0.9, 0.99, 1e-15, 1, sparse=True)
+        assert torch.isnan(p).tolist() == [False, True, False, False, False]

@@ -134,7 +134,16 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
 
 
 def adam(
-    parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, beta1: float, beta2: float, epsilon: float, count: int
+    parameter: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    count: int,
+    sparse: bool = False,
 ) -> None:
     """One step of Adam, in place."""
-    _backend(parameter).adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, count)
+    _backend(parameter).adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, count, sparse)
