@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
-RUN = 32  # pixels, one after the other, that are counted together: half a row of 64
+RUN = 32  # pixels, one after the other, that are counted together, at the least
+_MOST_RUNS = 1 << 18  # of a modality
 _KEPT = 0.8  # of a run's residual when a ray of it was looked at
 
 
@@ -26,18 +27,20 @@ class Importance:
     Args:
         pixels: how many each modality has. evenly: share of the rays that are drawn evenly; no ray weighs more than 1 / evenly.
     Attributes:
+        run: pixels of a run, of each modality; the last run may have fewer.
         residuals, density: of each run, (N,) float32; density relative to even draws.
     """
 
     def __init__(self, pixels: Mapping[str, int], evenly: float) -> None:
         self.pixels, self.evenly = dict(pixels), evenly
-        self.residuals = {name: np.ones(-(-count // RUN), np.float32) for name, count in pixels.items()}
+        self.run = {name: max(RUN, -(-count // _MOST_RUNS)) for name, count in pixels.items()}
+        self.residuals = {name: np.ones(-(-count // self.run[name]), np.float32) for name, count in pixels.items()}
         self.density = {name: np.ones_like(r) for name, r in self.residuals.items()}
         self._ends: dict[str, np.ndarray] = {}
         self._count()
 
     def _lengths(self, name: str, run: np.ndarray) -> np.ndarray:
-        return np.minimum(RUN, self.pixels[name] - RUN * run)
+        return np.minimum(self.run[name], self.pixels[name] - self.run[name] * run)
 
     def _count(self) -> None:
         for name, density in self.density.items():
@@ -56,12 +59,12 @@ class Importance:
         """Pixels of a modality, numbered as ``Pixels`` numbers them, and the weights of their rays, float32; (count,) each."""
         ends = self._ends[name]
         run = np.searchsorted(ends, random.random(count) * ends[-1], side="right").clip(max=len(ends) - 1)
-        pixel = RUN * run + (random.random(count) * self._lengths(name, run)).astype(np.int64)
+        pixel = self.run[name] * run + (random.random(count) * self._lengths(name, run)).astype(np.int64)
         return pixel, np.float32(ends[-1] / self.pixels[name]) / self.density[name][run]
 
     def learn(self, name: str, pixel: np.ndarray, residual: np.ndarray) -> None:
         """Take in the relative residuals of rays that were drawn, (R,) each."""
-        run = pixel // RUN
+        run = pixel // self.run[name]
         self.residuals[name][run] = _KEPT * self.residuals[name][run] + (1.0 - _KEPT) * residual
 
     def state_dict(self) -> dict[str, Any]:

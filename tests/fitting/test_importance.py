@@ -46,6 +46,18 @@ def test_runs_are_drawn_as_often_as_their_residuals_ask_for() -> None:
     assert stats.chisquare(within).pvalue > 1e-3
 
 
+def test_many_pixels_have_longer_runs() -> None:
+    """A rig of 25 Mpixel times 100 frames: what is counted stays small, and every pixel can be drawn."""
+    size = 2_500_000_000
+    importance = Importance({"a": size}, 0.5)
+    assert len(importance.residuals["a"]) <= 2**18
+    pixel, weight = importance.draw("a", 50_000, np.random.default_rng(0))
+    assert stats.kstest(pixel / size, "uniform").pvalue > 1e-3 and np.allclose(weight, 1.0)
+    importance.learn("a", pixel, np.zeros(len(pixel)))
+    importance.renew()
+    assert importance.draw("a", 50_000, np.random.default_rng(0))[1].max() <= 2.001
+
+
 def test_all_evenly_is_as_without() -> None:
     importance = _learned(1000, 1.0, 3)
     pixel, weight = importance.draw("a", 20_000, np.random.default_rng(0))
