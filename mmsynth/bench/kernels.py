@@ -211,7 +211,7 @@ def _adam_inputs(samples: int) -> Inputs:
 
 def _adam(backend: Any) -> Callable[[Inputs], Outputs]:
     def step(x: Inputs) -> Outputs:
-        backend.adam(x["parameter"], x["gradient"], x["first"], x["second"], 1e-2, 0.9, 0.99, 1e-15, 10)
+        backend.adam(x["parameter"], x["gradient"], x["first"], x["second"], kernels.AdamStep(1e-2, 0.9, 0.99, 1e-15, 10))
         return (x["parameter"],)
 
     return step

@@ -53,4 +53,4 @@ def run_kernels() -> None:
         kernels.shade(weights, hits.features, directions, 0)
     for count in (1, ADAM_CHUNK + 1):
         parameter, gradient, first, second = torch.zeros(4, count)
-        kernels.adam(parameter, gradient, first, second, 1e-3, 0.9, 0.99, 1e-15, 1)
+        kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))

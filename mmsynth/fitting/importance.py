@@ -1,8 +1,8 @@
 """Importance sampling of the training pixels: rays go more often where their residuals are large.
 
 A step estimates the mean loss over all pixels from a few thousand rays. Its gradient varies least when rays are drawn in proportion to
-the size of theirs (Katharopoulos and Fleuret 2018, eq. 6), which the residual stands for. Each ray weighs by how much more often than
-evenly it was drawn, so the expected gradient is that of even draws.
+the size of theirs (Katharopoulos and Fleuret 2018, eq. 6), which the residual stands for. Each ray weighs less by as much as it was
+drawn more often than evenly, so the expected gradient is that of even draws.
 """
 
 from __future__ import annotations

@@ -39,7 +39,8 @@ class Adam:
                 rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
                 met = slice((rows or {}).get(name))
                 first, second = self.moments[name]
-                kernels.adam(p[met], p.grad[met], first[met], second[met], rate, *_BETAS, _EPSILON, self.count, name in self.sparse)
+                step = kernels.AdamStep(rate, *_BETAS, _EPSILON, self.count, name in self.sparse)
+                kernels.adam(p[met], p.grad[met], first[met], second[met], step)
 
     def resize(self, name: str, kept: int) -> None:
         """Follow a parameter that has new rows behind its first ``kept``."""

@@ -413,7 +413,7 @@ def test_adam_is_torchs(shape: tuple[int, ...], dtype: torch.dtype, tolerance: f
         optimiser.param_groups[0]["lr"] = rate
         theirs.grad = gradient.double()
         optimiser.step()
-        kernels.adam(ours, gradient, first, second, rate, 0.9, 0.99, 1e-15, count)
+        kernels.adam(ours, gradient, first, second, kernels.AdamStep(rate, 0.9, 0.99, 1e-15, count))
         assert not gradient.any()
         torch.testing.assert_close(ours.double(), theirs.detach(), atol=tolerance, rtol=0)
     state = optimiser.state[theirs]
@@ -426,7 +426,7 @@ def test_adam_leaves_what_never_had_a_gradient() -> None:
         p, zero = torch.randn(100, dtype=dtype), torch.zeros(100, dtype=dtype)
         before = p.clone()
         for count in (1, 2):
-            kernels.adam(p, zero.clone(), first := zero.clone(), second := zero.clone(), 0.1, 0.9, 0.99, 1e-15, count)
+            kernels.adam(p, zero.clone(), first := zero.clone(), second := zero.clone(), kernels.AdamStep(0.1, 0.9, 0.99, 1e-15, count))
         assert torch.equal(p, before) and not first.any() and not second.any()
 
 
@@ -446,7 +446,7 @@ def test_sparse_adam_is_torchs(rows: int, dtype: torch.dtype, tolerance: float) 
         before = [x.clone() for x in (ours, first, second)]
         theirs.grad = torch.sparse_coo_tensor(met[None], gradient[met].double(), ours.shape)
         optimiser.step()
-        kernels.adam(ours, gradient, first, second, 0.02, 0.9, 0.99, 1e-15, count, sparse=True)
+        kernels.adam(ours, gradient, first, second, kernels.AdamStep(0.02, 0.9, 0.99, 1e-15, count, sparse=True))
         assert not gradient.any()
         kept = torch.ones(rows, dtype=torch.bool).index_fill(0, met, False)
         assert all(torch.equal(x[kept], old[kept]) for x, old in zip((ours, first, second), before, strict=True))
@@ -460,7 +460,7 @@ def test_a_number_met_once_moves_by_about_the_rate() -> None:
         p, first, second = torch.zeros(3, 1)
         for count in range(1, 200):
             gradient = torch.full((1,), 2.5 if count == 50 else 0.0)
-            kernels.adam(p, gradient, first, second, 0.01, 0.9, 0.99, 1e-15, count, sparse)
+            kernels.adam(p, gradient, first, second, kernels.AdamStep(0.01, 0.9, 0.99, 1e-15, count, sparse))
         moved.append(-float(p))
     assert moved[0] > 0.06 and moved[1] == pytest.approx(0.01, rel=0.4)
 
@@ -469,5 +469,5 @@ def test_a_gradient_that_is_not_a_number_is_not_passed_over() -> None:
     for dtype in (torch.float32, torch.float64):
         p, first, second = torch.zeros(3, 5, dtype=dtype)
         gradient = torch.tensor([0.0, float("nan"), 1.0, 0.0, -1.0], dtype=dtype)
-        kernels.adam(p, gradient, first, second, 0.01, 0.9, 0.99, 1e-15, 1, sparse=True)
+        kernels.adam(p, gradient, first, second, kernels.AdamStep(0.01, 0.9, 0.99, 1e-15, 1, sparse=True))
         assert torch.isnan(p).tolist() == [False, True, False, False, False]

@@ -20,6 +20,7 @@ from mmsynth.field.kernels import cpu, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
+    AdamStep,
     GridTable,
     Hits,
     Lamps,
@@ -39,6 +40,7 @@ __all__ = [
     "OUTSIDE",
     "SHELL",
     "SOLID",
+    "AdamStep",
     "GridTable",
     "Hits",
     "Lamps",
@@ -133,17 +135,6 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
 
 
-def adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    count: int,
-    sparse: bool = False,
-) -> None:
+def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """One step of Adam, in place."""
-    _backend(parameter).adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, count, sparse)
+    _backend(parameter).adam(parameter, gradient, first, second, step)

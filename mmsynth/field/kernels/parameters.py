@@ -168,3 +168,20 @@ class Mirrors(NamedTuple):
     points: Tensor
     directions: Tensor
     share: Tensor
+
+
+class AdamStep(NamedTuple):
+    """What a step of Adam is told beside its tensors.
+
+    Attributes:
+        rate, beta1, beta2, epsilon: as Kingma and Ba 2015 name them. number: of the step, 1 at the first.
+        sparse: numbers without a gradient keep their value and their moments (``torch.optim.SparseAdam``), as the rows of a table do that
+            a step did not meet: otherwise one gradient alone moves them ten times as far as a rate.
+    """
+
+    rate: float
+    beta1: float
+    beta2: float
+    epsilon: float
+    number: int
+    sparse: bool = False

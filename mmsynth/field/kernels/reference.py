@@ -28,6 +28,7 @@ from mmsynth.field.kernels.constants import (
 )
 from mmsynth.field.kernels.mirroring import mirror as mirror  # this and ``shading`` are of the reference, too
 from mmsynth.field.kernels.parameters import (
+    AdamStep,
     GridTable,
     Hits,
     Rays,
@@ -313,28 +314,16 @@ def _median_depth(t: Tensor, weights: Tensor, before: Tensor, crossing: Tensor, 
 
 
 @torch.no_grad()
-def adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    count: int,
-    sparse: bool = False,
-) -> None:
+def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """One step of Adam (Kingma and Ba 2015, algorithm 1), in place; the gradient is cleared.
 
     Args:
-        parameter, gradient, first, second: one shape; the moments are updated. count: 1 at the first step.
-        sparse: numbers without a gradient keep their value and their moments (``torch.optim.SparseAdam``), as the rows of a table do that
-            a step did not meet: otherwise one gradient alone moves them ten times as far as a rate.
+        parameter, gradient, first, second: one shape; the moments are updated.
     """
+    rate, beta1, beta2, epsilon, count, sparse = step
     moved = gradient != 0 if sparse else torch.ones_like(gradient, dtype=torch.bool)
     m, v = first * beta1 + gradient * (1 - beta1), second * beta2 + gradient * gradient * (1 - beta2)
-    step = m / ((v / (1 - beta2**count)).sqrt_().add_(epsilon)) * (rate / (1 - beta1**count))
-    for kept, new in ((first, m), (second, v), (parameter, parameter - step)):
+    change = m / ((v / (1 - beta2**count)).sqrt_().add_(epsilon)) * (rate / (1 - beta1**count))
+    for kept, new in ((first, m), (second, v), (parameter, parameter - change)):
         kept.copy_(torch.where(moved, new, kept))
     gradient.zero_()
