@@ -17,7 +17,7 @@ import mmsynth
 # from the top down; modules of one room may import each other
 ROOMS = """
     errors version packaged files toml
-    sensors scene field.kernels field fitting
+    sensors scene prior field.kernels field fitting
     operations.output operations.views operations.conversion operations.simulation operations.dataset operations.mesh operations.evaluation
     operations.export
     report workflows bench cli

@@ -68,6 +68,12 @@ def fit(
     masks: MasksOption = None,
     budget: Annotated[str | None, typer.Option(help="training time, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="length in optimiser steps instead")] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="predict the modalities that the scene lacks: a file of `mmsynth prior`, or default", metavar="FILE")
+    ] = None,
+    exposure: Annotated[
+        Path | None, typer.Option(help="gains or white boards of the modalities, for --prior; default: exposure.json in the scene")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
@@ -79,11 +85,15 @@ def fit(
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.trainer import FitProgress
     from mmsynth.report.text import fit_text
+    from mmsynth.scene.exposure import read_exposure
     from mmsynth.scene.load import load_scene
     from mmsynth.scene.scene import keep_frames
     from mmsynth.workflows.fit import fit_run
+    from mmsynth.workflows.prior import find_prior
 
     seconds = fit_length(steps, budget)
+    of_scenes = None if prior is None else find_prior(prior)
+    stated = None if exposure is None else read_exposure(exposure)
     meaning, folder = masks_of(masks)
     read = load_scene(
         scene_path(scene), modalities=modality_names(modalities), layout=layout, images=images, also=sensor_folders(also),
@@ -108,7 +118,7 @@ def fit(
 
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
-            on_start=lambda needs: explain(needs.choices), on_step=on_step,
+            prior=of_scenes, exposure=stated, on_start=lambda needs: explain(needs.choices), on_step=on_step,
         )  # fmt: skip
         explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
     print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
@@ -178,6 +188,33 @@ def batch(
     failed = [name for name, outcome in outcomes.items() if "error" in outcome]
     if failed:
         raise InputError(f"batch: {len(failed)} of {len(outcomes)} scenes failed, first: {outcomes[failed[0]]['error']}")
+
+
+@command("prior")
+def prior(
+    sources: Annotated[
+        list[Path], typer.Argument(help="runs, or scenes, which are fitted first, each with several modalities", metavar="RUN|SCENE...")
+    ],
+    out: Annotated[Path, typer.Option(help="the file to write")] = Path("prior.safetensors"),
+    budget: Annotated[str | None, typer.Option(help="time of the fit of each scene, e.g. 60s, 5m; default 60s")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="or its optimiser steps")] = None,
+    device: DeviceOption = "auto",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Learn what scenes have in common, so that `fit --prior` can predict modalities that a scene lacks."""
+    from mmsynth.fitting.device import pick_device
+    from mmsynth.report.text import prior_text
+    from mmsynth.workflows.prior import make_prior
+
+    seconds = fit_length(steps, budget)
+    made = make_prior(
+        sources, out, budget=seconds, steps=steps, seed=seed, device=pick_device(device), say=(lambda text: None) if as_json else print
+    )
+    if as_json:
+        print(json.dumps({"prior": str(out), "scenes": list(made.scenes), "modalities": list(made.sensors)}))
+    else:
+        print(prior_text(made, out))
 
 
 @command("doctor")

@@ -16,10 +16,12 @@ from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.kernels.mirroring import material
-from mmsynth.field.light import Light, stokes, stokes_around
+from mmsynth.field.light import Light, mean_spectrum, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
+from mmsynth.prior.prediction import Predicted, Prediction
+from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
 from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
@@ -41,6 +43,7 @@ class Rendering:
         normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit, or not asked for.
         opacity: (H, W) float32 in [0, 1], of the region of interest; 0 where the surface met lies outside it.
         valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
+        deviation: per modality that is predicted and was not measured (H, W, C), the standard deviation of its channels.
     """
 
     channels: dict[str, np.ndarray]
@@ -50,6 +53,7 @@ class Rendering:
     normal: np.ndarray
     opacity: np.ndarray
     valid: np.ndarray
+    deviation: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,9 @@ class Field(nn.Module):
     scene's world frame and unit.
 
     Attributes:
-        sensors: the modalities it knows. cameras: representative intrinsics of each.
+        sensors: the modalities it knows, those that a prior predicts after those that were measured. cameras: representative intrinsics of
+            each that was measured.
+        prediction: of modalities that were not measured, None: there are none.
         rig: sensor → (4, 4) sensor_to_reference, scene unit; the reference is the first sensor.
         sampling: how finely it is rendered. manifest: everything known about the fit.
         view_dependence: degree of the spherical harmonics of each modality's radiance.
@@ -117,6 +123,7 @@ class Field(nn.Module):
         self.cameras, self.rig = cameras or {}, rig or {}
         self.view_dependence = dict.fromkeys(sensors, 0)
         self.corrections = Corrections({}, {})
+        self.prediction: Prediction | None = None
         self.manifest: dict[str, Any] = {}
         extent = 2.0 if d.background else 1.0
         spheres = (d.initial_radius, d.outer_radius if d.background else 1e9)
@@ -133,6 +140,16 @@ class Field(nn.Module):
     @property
     def device(self) -> torch.device:
         return self.occupancy.states.device
+
+    @property
+    def measured(self) -> list[str]:
+        """The modalities that were learned from frames."""
+        return list(self.radiance_scale)
+
+    def predict(self, prediction: Prediction) -> None:
+        """Know the modalities of a prior, too."""
+        self.prediction = prediction
+        self.sensors = {name: self.sensors[name] for name in self.measured} | prediction.sensors
 
     def pose_of(self, frame: Frame) -> np.ndarray:
         """(4, 4) camera_to_world of a frame of the scene, corrected by what the fit found.
@@ -199,7 +216,8 @@ class Field(nn.Module):
 
         With ``geometry`` also normal: that takes four more samples a ray, depth comes with the light. With ``light``, of a field whose
         surfaces mirror lamps, also ``mirrored/<name>`` (R, C), the images of lamps in each modality, and roughness and strength (R,): means
-        over the surfaces met, NaN where less than half of a ray meets any. Of a polarization modality ``mirrored_s0/<name>`` (R,), too.
+        over the surfaces met, NaN where less than half of a ray meets any; of a polarization modality ``mirrored_s0/<name>`` (R,), too; and
+        ``images`` (R, 3), Stokes vectors of lamps of their mean spectrum. Of a predicted modality also ``deviation/<name>`` (R, C).
         """
         jitter = torch.full((len(origins),), 0.5, device=origins.device)
         hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
@@ -217,6 +235,59 @@ class Field(nn.Module):
         light: bool = False,
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
+        measured = [name for name in modalities if name not in self.predicted]
+        if self.prediction is None or len(measured) == len(modalities):
+            return self._shade(hits, origins, directions, camera_x, measured, geometry, light)
+        prediction = self.prediction
+        wanted = [name for name in modalities if name in self.predicted]
+        polarized = any(self.sensors[name].is_polarization for name in wanted)
+        needed = list(dict.fromkeys([*measured, *prediction.facts.known]))
+        out = self._shade(hits, origins, directions, camera_x, needed, geometry or polarized, True)
+        found = self._predict(prediction, out, directions, camera_x, polarized)
+        for name in wanted:
+            out[name], out[f"deviation/{name}"], out[f"mirrored/{name}"] = found[name].light, found[name].deviation, found[name].images
+            stokes, of_lamps = found[name].stokes, found[name].images_s0
+            if stokes is not None and of_lamps is not None:
+                out[f"stokes/{name}"], out[f"mirrored_s0/{name}"] = stokes, of_lamps
+        return out
+
+    @property
+    def predicted(self) -> list[str]:
+        """The modalities that a prior predicts."""
+        return [] if self.prediction is None else list(self.prediction.sensors)
+
+    def _predict(
+        self, prediction: Prediction, seen: dict[str, Tensor], directions: Tensor, camera_x: Tensor, polarized: bool
+    ) -> dict[str, Predicted]:
+        """Of rays that show what ``_shade`` found of them."""
+        zero = torch.zeros_like(seen["opacity"])
+        shapes = None
+        if polarized:
+            met = torch.isfinite(seen["normal"]).all(1)
+            x, y = reference_axes(directions, camera_x)
+            gloss = [torch.where(met & torch.isfinite(seen.get(key, zero)), seen.get(key, zero), zero) for key in ("roughness", "strength")]
+            shapes = shapes_of(torch.where(met[:, None], seen["normal"], -directions), directions, x, y, *gloss)
+        images = seen.get("images", torch.zeros_like(directions))
+        return prediction({name: self.body_of(name, seen) for name in prediction.facts.known}, images, shapes)
+
+    def body_of(self, name: str, seen: dict[str, Tensor]) -> Tensor:
+        """Light without the images of lamps, (R, C), of a polarization modality S0, (R, 1), of what ``render_rays`` found with ``light``."""
+        if self.sensors[name].is_polarization:
+            s0 = seen[f"stokes/{name}"][:, :1]
+            return s0 - seen[f"mirrored_s0/{name}"][:, None] if self.shines else s0
+        return seen[name] - seen[f"mirrored/{name}"] if self.shines else seen[name]
+
+    def _shade(
+        self,
+        hits: rendering.Hits,
+        origins: Tensor,
+        directions: Tensor,
+        camera_x: Tensor,
+        modalities: Sequence[str],
+        geometry: bool,
+        light: bool = False,
+    ) -> dict[str, Tensor]:
+        """``shade_hits`` of measured modalities."""
         shaded, rays = self.with_far_light(hits), len(directions)
         ray = kernels.rays_of(hits.behind)
         lamps = self.light.lamps() if self.light is not None and self.shines and modalities else None
@@ -257,6 +328,9 @@ class Field(nn.Module):
                 if light:
                     out[f"mirrored/{name}"], out[f"mirrored_s0/{name}"] = stokes_to_intensities(of_lamps, angles), of_lamps[:, 0]
         if light and mirrors is not None:
+            if lamps is not None and images is not None:
+                x, y = (axis[ray] for axis in reference_axes(directions, camera_x))
+                out["images"] = together(stokes(images, (lamps.spectrum / mean_spectrum(lamps.spectrum)).mean(1), x, y), hits.share)
             of = material(mirrors.material)
             met = torch.where(hits.opacity > 0.5, hits.opacity, torch.full_like(hits.opacity, float("nan")))
             for key, value in (("roughness", of.roughness), ("strength", of.strength)):
@@ -364,6 +438,7 @@ class Field(nn.Module):
             normal=image("normal", 3, np.nan),
             opacity=image("opacity", 1, 0.0)[..., 0],
             valid=valid.copy(),
+            deviation={n: image(f"deviation/{n}", self.sensors[n].channel_count, np.nan) for n in names if n in self.predicted},
         )
 
     def check_modalities(self, modalities: Sequence[str] | None) -> list[str]:

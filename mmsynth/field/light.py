@@ -77,6 +77,11 @@ def _layer(chunks: Tensor, layer: nn.Linear) -> Tensor:
     return torch.baddbmm(layer.bias[None, None], chunks, layer.weight.T.expand(len(chunks), -1, -1))
 
 
+def mean_spectrum(spectrum: Tensor) -> Tensor:
+    """(outputs,) geometric mean over lamps of their spectra (K, outputs) > 0."""
+    return torch.exp(torch.log(spectrum).mean(0))
+
+
 def stokes(reflection: Reflection, spectrum: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Stokes vectors (H, 3) of the images of lamps of ``spectrum`` (K,), in the frame of axes x, y (H, 3)."""
     light = reflection.amount * spectrum

@@ -15,17 +15,29 @@ from mmsynth.errors import InputError
 from mmsynth.field.field import Corrections, Design, Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.warmup import warm_up
-from mmsynth.files import read_json, write_atomic, write_json
+from mmsynth.files import read_json, sha256_of, write_atomic, write_json
+from mmsynth.prior.prediction import SceneFacts, predict
+from mmsynth.prior.prior import load_prior, save_prior
 from mmsynth.scene.scene import Region
 from mmsynth.scene.serialisation import camera_from_json, camera_to_json, sensor_from_json, sensor_to_json
 
 FORMAT = 2  # of the run folder; 1 had none and other names
+PRIOR_FILE = "prior.safetensors"  # in it, of a field that predicts modalities
 
 
 def save_field(field: Field, run: Path) -> None:
-    """Write ``field.safetensors`` and ``manifest.json`` into the run folder, each atomically, the manifest last."""
+    """Write ``field.safetensors`` and ``manifest.json`` into the run folder, of a field that predicts modalities also its prior, each
+    atomically, the manifest last."""
     content = save({k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()})
     write_atomic(run / "field.safetensors", lambda path: path.write_bytes(content))
+    if field.prediction is not None:
+        save_prior(field.prediction.prior, run / PRIOR_FILE)
+        field.manifest["prior"] = {
+            "sha256": sha256_of(run / PRIOR_FILE),
+            "scenes": list(field.prediction.prior.scenes),
+            "predicted": [sensor_to_json(s) for s in field.prediction.sensors.values()],
+            "facts": asdict(field.prediction.facts),
+        }
     field.manifest["format"] = FORMAT
     field.manifest["field"] = {
         "design": asdict(field.design),
@@ -34,7 +46,7 @@ def save_field(field: Field, run: Path) -> None:
         "view_dependence": field.view_dependence,
         "region": asdict(field.region),
         "unit": field.unit,
-        "sensors": [sensor_to_json(s) for s in field.sensors.values()],
+        "sensors": [sensor_to_json(field.sensors[name]) for name in field.measured],
         "cameras": {n: camera_to_json(c) for n, c in field.cameras.items()},
         "rig": {n: m.tolist() for n, m in field.rig.items()},
         "corrections": {
@@ -63,6 +75,9 @@ def load_field(run: Path, device: str = "cpu") -> Field:
     try:
         field = _from_json(manifest["field"])
         field.load_state_dict(load_file(run / "field.safetensors"))
+        if "prior" in manifest:
+            facts = SceneFacts.from_json(manifest["prior"]["facts"])
+            field.predict(predict(load_prior(run / PRIOR_FILE), facts, field.measured))
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: not the manifest of a fit of this version ({error}).") from error
     except (OSError, SafetensorError, RuntimeError) as error:

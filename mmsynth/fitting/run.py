@@ -16,14 +16,19 @@ import numpy as np
 import torch
 
 from mmsynth.field.field import Field
+from mmsynth.field.samples import sample_field
 from mmsynth.field.storage import save_field
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_text
 from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
+from mmsynth.fitting.choices import switch
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.prior.prediction import common, predict, scene_facts
+from mmsynth.prior.prior import Prior
+from mmsynth.scene.exposure import Exposure, stated_exposure
 from mmsynth.scene.scene import Scene
 from mmsynth.scene.serialisation import CONVENTIONS, source_to_json
 from mmsynth.version import __version__
@@ -43,6 +48,8 @@ def fit(
     seed: int = 0,
     device: str = "cpu",
     resume: bool = False,
+    prior: Prior | None = None,
+    exposure: Exposure | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
 ) -> Field:
@@ -53,9 +60,11 @@ def fit(
         steps: length in optimiser steps, or ``budget``: length in seconds of training; when both are None, what a resumed
             checkpoint was planned for, else 60 s.
         device: cpu or cuda. resume: go on from the run's checkpoint, if it has one.
+        prior: to predict modalities that the scene lacks. exposure: of the scene; None: what it states.
         on_start: called once with what the scene was found to need. on_step: called after every step.
     Raises:
-        InputError: the scene or recipe cannot be read, the run folder cannot be written, or a checkpoint does not fit.
+        InputError: the scene or recipe cannot be read, the run folder cannot be written, a checkpoint does not fit, or the prior has no
+            channels in common with the scene.
         DivergedError: loss or gradients stopped to be finite; the checkpoint is kept.
     """
     saved = read_checkpoint(run) if resume else None
@@ -64,6 +73,9 @@ def fit(
         steps, budget = planned.get("steps") or None, planned.get("budget") or None
         if steps is None and budget is None:
             budget = _BUDGET
+    exposure = stated_exposure(scene) if exposure is None else exposure
+    if prior is not None:
+        common(prior, scene.sensors)
     if device == "cpu":
         warm_up()
     trainer = Trainer(scene, recipe if isinstance(recipe, Recipe) else load_recipe(recipe), steps, budget, seed, device)
@@ -100,8 +112,30 @@ def fit(
     _save(run, trainer, log)
     field = _finished(trainer)
     field.manifest = _manifest(trainer, scene)
+    if prior is not None:
+        _predict(field, scene, prior, exposure)
     save_field(field, run)
     return field
+
+
+def _predict(field: Field, scene: Scene, prior: Prior, exposure: Exposure) -> None:
+    """Let the field know what the prior says of modalities that the scene lacks, and the manifest, what that is."""
+    frames = scene.frames_of(field.measured[0], scene.split.train)
+    error = {name: 10.0 ** (-psnr / 20.0) for name, psnr in field.manifest["train_psnr"].items()}
+    began = time.perf_counter()
+    facts = scene_facts(prior, sample_field(field, frames, scene.root.name, exposure), error)
+    prediction = predict(prior, facts, field.measured)
+    if not prediction.sensors:
+        why = f"the scene has all modalities that the prior of {len(prior.scenes)} scenes knows"
+        field.manifest["needs"]["choices"]["prior"] = asdict(switch(False, why))
+        return
+    field.predict(prediction)
+    levels = f"; levels of {', '.join(facts.free)} are what is usual, as no exposure is stated" if facts.free else ""
+    why = (
+        f"{', '.join(prediction.sensors)} predicted from {', '.join(facts.known)}, by {len(prior.scenes)} scenes; "
+        f"the lamps' colour by {facts.how}{levels}; took {time.perf_counter() - began:.1f} s"
+    )
+    field.manifest["needs"]["choices"]["prior"] = asdict(switch(True, why))
 
 
 def _save(run: Path, trainer: Trainer, log: list[str]) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mmsynth.operations.simulation.calibrate_noise import Calibrated
+    from mmsynth.prior.prior import Prior
 
 _COLUMNS = {
     "psnr": "psnr [dB]",
@@ -23,6 +24,11 @@ _COLUMNS = {
     "dolp_rmse": "dolp rmse",
     "aolp_mae": "aolp [deg]",
 }
+
+
+def prior_text(prior: Prior, path: Path) -> str:
+    """What a prior knows, for a terminal."""
+    return f"wrote {path} ({path.stat().st_size / 1000:.0f} kB): {', '.join(prior.sensors)}, of {len(prior.scenes)} scenes"
 
 
 def fit_text(facts: Mapping[str, Any]) -> str:

@@ -12,7 +12,9 @@ from mmsynth.fitting.run import fit
 from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.progress import Progress
+from mmsynth.prior.prior import Prior
 from mmsynth.report.report import write_run_report
+from mmsynth.scene.exposure import Exposure
 from mmsynth.scene.scene import Scene
 from mmsynth.workflows.runs import Run, mark_latest, new_run, run_to_resume
 
@@ -27,6 +29,8 @@ def fit_run(
     seed: int = 0,
     device: str = "cpu",
     resume: bool = False,
+    prior: Prior | None = None,
+    exposure: Exposure | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
 ) -> Run:
@@ -48,6 +52,8 @@ def fit_run(
         seed=seed,
         device=device,
         resume=resume,
+        prior=prior,
+        exposure=exposure,
         on_start=on_start,
         on_step=on_step,
     )

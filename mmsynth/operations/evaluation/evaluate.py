@@ -15,7 +15,10 @@ averaged per view in dB):
   everywhere; both clipped to [0, 1], the range that frames can record.
 * ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
 * ``psnr_highlights, psnr_silhouettes, psnr_rest``: of ``psnr_aligned``, its parts (see ``parts``), where ``gt/geometry`` tells them.
-* ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``dolp_rmse``; ``aolp_mae``:
+* ``psnr_aligned_free_gain``: of a predicted modality, ``psnr_aligned`` times the one gain that suits best, ``free_gain``; ``within_2sd``: the
+  share of pixels and channels whose error is below two of the deviations that were predicted.
+* ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``s1_s2_rmse``, beside
+  ``s1_s2_unpolarized_rmse``, that of saying that nothing is polarized; ``dolp_rmse``, ``dolp_mae``; ``aolp_mae``:
   circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
   at the own pose.
 * geometry, at the RGB pose, in the region: ``depth_mae`` (z-depth, scene unit), ``normal_mae_deg`` and
@@ -103,7 +106,8 @@ class _Exam:
 
     def __init__(self, field: Field, scene: Scene, truth: GroundTruth, count: Counter) -> None:
         self.field, self.truth, self.count, self.metric, self.masks = field, truth, count, scene.unit == "m", scene.masks
-        names = [name for name in field.sensors if name in scene.sensors]
+        # what a prior predicts has no frames, and is scored where there is truth
+        names = [name for name in field.sensors if name in scene.sensors or name in field.predicted]
         self.scores = {name: _Scores() for name in names}
         self.own_pose = {name: _Scores() for name in names}
         self.geometry = _Scores()
@@ -158,6 +162,8 @@ def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
         sensor = exam.field.sensors[name]
         _checked(light, (*size, _components(sensor)), f"gt/aligned, {name} view {frame.view}")
         _score_truth(exam.scores[name], "psnr_aligned", sensor, rendering, light, where)
+        if name in exam.field.predicted:
+            _score_prediction(exam.scores[name], sensor, rendering, light, where)
         if "depth_z" in shape:
             brightness = light[..., :1] if sensor.is_polarization else light
             for part, pixels in parts_of(brightness, shape, exam.truth.labels(), where).items():
@@ -263,12 +269,27 @@ def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering
     scores.add(key, difference[where & rendering.valid] ** 2)
 
 
+def _score_prediction(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
+    """What is asked of a modality that was not measured: how good it is but for its gain, and whether it knows how good it is."""
+    seen = where & rendering.valid
+    if sensor.polarizer_angles_deg is not None:
+        truth = stokes_to_intensities(torch.from_numpy(truth), sensor.polarizer_angles_deg).numpy()
+    ours, real = (np.clip(v[seen], 0.0, 1.0).astype(np.float64) for v in (rendering.channels[sensor.name], truth))
+    for key, values in (("ours_ours", ours * ours), ("ours_true", ours * real), ("true_true", real * real)):
+        scores.add(f"gain/{key}", values)
+    error = np.abs(rendering.channels[sensor.name][seen] - truth[seen])
+    scores.add("within_2sd", error < 2.0 * rendering.deviation[sensor.name][seen])
+
+
 def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """Errors that PSNR does not show: the shape of the spectrum, the polarization."""
     where = where & rendering.valid
     if sensor.is_polarization:
         ours, real = (torch.from_numpy(s[where].astype(np.float64)) for s in (rendering.stokes[sensor.name], truth))
         scores.add("stokes_rmse", ((ours - real) ** 2).numpy())
+        scores.add("dolp_mae", (degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)).abs().numpy())
+        scores.add("s1_s2_rmse", ((ours - real)[:, 1:] ** 2).numpy())
+        scores.add("s1_s2_unpolarized_rmse", (real[:, 1:] ** 2).numpy())
         scores.add("dolp_rmse", ((degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)) ** 2).numpy())
         error = aolp_difference(angle_of_linear_polarization(ours), angle_of_linear_polarization(real)).abs()
         scores.add("aolp_mae", error.numpy(), real[:, 1:].norm(dim=1).numpy())
@@ -312,6 +333,16 @@ def _values(scores: _Scores, keys: Sequence[str]) -> dict[str, Any]:
     return {key: value for key, value in found.items() if value is not None}
 
 
+def _prediction(scores: _Scores) -> dict[str, Any]:
+    """Of a predicted modality: PSNR with the one gain that suits best, that gain, and how often the error is below two deviations."""
+    ours, both, true = (scores.value(f"gain/{key}") for key in ("ours_ours", "ours_true", "true_true"))
+    within = scores.value("within_2sd")
+    if not ours or both is None or true is None or within is None:
+        return {}
+    mse = max(true - both * both / ours, 0.0)
+    return {"predicted": True, "psnr_aligned_free_gain": psnr_from_mse(mse), "free_gain": both / ours, "within_2sd": within}
+
+
 def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
     """The keys of one modality in the order of the module docstring."""
     out = _values(scores, ("psnr",))
@@ -321,5 +352,6 @@ def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
             out |= {"psnr_foreground": value, "psnr_foreground_view_mean": scores.value(f"view_mean/{source}"), "foreground_from": source}
             break
     out |= _values(scores, ("ssim", "psnr_truth", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS)))
-    light = ("sam", "stokes_rmse", "dolp_rmse", "aolp_mae")
+    out |= _prediction(scores)
+    light = ("sam", "stokes_rmse", "s1_s2_rmse", "s1_s2_unpolarized_rmse", "dolp_rmse", "dolp_mae", "aolp_mae")
     return out | (_values(scores, light) or _values(own_pose, light))

@@ -1,0 +1,69 @@
+"""A prior of several scenes: their fields, what these show, what it has in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from mmsynth.errors import InputError
+from mmsynth.field.samples import sample_field
+from mmsynth.fitting.run import fit
+from mmsynth.packaged import data_folder
+from mmsynth.prior.prior import Prior, learn_prior, load_prior, save_prior
+from mmsynth.scene.exposure import stated_exposure
+from mmsynth.scene.load import load_scene
+from mmsynth.workflows.runs import Run, is_run, open_run
+
+
+def make_prior(
+    sources: Sequence[Path],
+    out: Path,
+    *,
+    budget: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    say: Callable[[str], None] = lambda text: None,
+) -> Prior:
+    """Learn a prior from runs, and from scenes, which are fitted first, and write it.
+
+    Args:
+        sources: run folders or scenes, each with several modalities. budget, steps, device: of the fits of scenes, see ``fit``; their runs are
+            in ``OUT's folder/prior_runs/SCENE`` and are taken again where they are finished. say: told one line a source.
+    Raises:
+        InputError: no sources, one that is neither run nor scene or has one modality, or the file cannot be written.
+    """
+    if not sources:
+        raise InputError("prior: no scenes, expected runs or scenes with several modalities.")
+    runs = [_run_of(source, out.parent / "prior_runs", budget, steps, seed, device, say) for source in sources]
+    samples = []
+    for run in runs:
+        frames = run.scene.frames_of(run.field.measured[0], run.scene.split.train)
+        samples.append(sample_field(run.field, frames, run.scene.root.resolve().name, stated_exposure(run.scene), seed=seed))
+        say(f"{run.folder}: {len(samples[-1].images):,} rays of {', '.join(run.field.measured)}")
+    prior = learn_prior(samples, seed)
+    save_prior(prior, out)
+    return prior
+
+
+def _run_of(source: Path, folder: Path, budget: float | None, steps: int | None, seed: int, device: str, say: Callable[[str], None]) -> Run:
+    if is_run(source):
+        return open_run(source, device=device)
+    scene = load_scene(source)
+    if len(scene.sensors) < 2:
+        raise InputError(f"{source}: one modality ({', '.join(scene.sensors)}), expected several: a prior learns one from the other.")
+    run = folder / scene.root.resolve().name
+    if is_run(run):
+        return open_run(run, device=device)
+    say(f"{source}: fitting it into {run}")
+    return Run(run, fit(scene, run, budget=budget, steps=steps, seed=seed, device=device), scene)
+
+
+def find_prior(name: str) -> Prior:
+    """A prior by its file, or a packaged one by its name.
+
+    Raises:
+        InputError: there is none.
+    """
+    packaged = data_folder("recipes") / "priors" / f"{name}.safetensors"
+    return load_prior(packaged if Path(name).suffix == "" and packaged.is_file() else Path(name))
