@@ -82,11 +82,11 @@ def sensor_folders(given: list[str] | None) -> dict[str, str]:
     return found
 
 
-def modality_pairs(text: str, known: list[str]) -> list[tuple[str, str]]:
+def modality_pairs(text: str, sources: list[str], targets: list[str]) -> list[tuple[str, str]]:
     from mmsynth.scene.scene import canonical_modality
 
     if text == "all":
-        return [(a, b) for a in known for b in known if a != b]
+        return [(a, b) for a in sources for b in targets if a != b]
     if not re.fullmatch(r"[^:,\s]+:[^:,\s]+(,[^:,\s]+:[^:,\s]+)*", text):
         raise InputError(f"--convert {text!r}: expected pairs such as rgb:ms or rgb:ms,mono:pol, or all.")
     pairs = [part.split(":") for part in text.split(",")]

@@ -146,7 +146,7 @@ def evaluate(
             scores = evaluate_run(opened, progress=show)
             print(json.dumps(scores) if as_json else score_text(scores))
         else:
-            pairs = modality_pairs(convert, list(opened.field.sensors))
+            pairs = modality_pairs(convert, opened.field.measured, list(opened.field.sensors))
             conversions = evaluate_conversions(opened.field, opened.scene, pairs, progress=show)
             print(json.dumps({"conversions": conversions}) if as_json else conversion_text(conversions))
 

@@ -34,6 +34,8 @@ _COLUMNS = {
     "ssim": ("SSIM", 3),
     "psnr_truth": ("PSNR against truth [dB]", 2),
     "psnr_aligned": ("PSNR aligned [dB]", 2),
+    "psnr_aligned_free_gain": ("aligned, free gain [dB]", 2),
+    "within_2sd": ("within 2 deviations", 3),
     "psnr_highlights": ("highlights [dB]", 2),
     "psnr_silhouettes": ("silhouettes [dB]", 2),
     "psnr_rest": ("the rest [dB]", 2),
@@ -127,7 +129,7 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tupl
     Returns:
         the id of the first test view (None: no frame) and the rows.
     """
-    names = [name for name in field.sensors if name in scene.sensors]
+    names = [name for name in field.measured if name in scene.sensors]
     frames = {name: (scene.frames_of(name, scene.split.test) or scene.frames_of(name))[:1] for name in names}
     rows: list[list[tuple[str, np.ndarray]]] = []
     geometry: list[tuple[str, np.ndarray]] = []
@@ -157,13 +159,37 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tupl
                 geometry = [("depth", previews.preview_depth(rendering.depth_z)), ("normals", previews.preview_normal(rendering.normal))]
                 geometry.append(("opacity", previews.to_uint8(rendering.opacity)))
             rows.append(row)
+    shown = next((of[0] for of in frames.values() if of), None)
+    if field.predicted and shown is not None:
+        rows += _predicted_rows(field, shown)
     return view, [*rows, geometry] if rows else rows
+
+
+def _predicted_rows(field: Field, frame: Frame) -> list[list[tuple[str, np.ndarray]]]:
+    """Of each modality that a prior predicts, at a frame's pose: prediction | deviation, for polarization also AoLP and DoLP."""
+    rendering = field.render(frame.camera, field.pose_of(frame), field.predicted, geometry=False)
+    rows = []
+    for name in field.predicted:
+        sensor, ours = field.sensors[name], rendering.channels[name]
+        exposure = previews.exposure_of(previews.preview_linear(sensor, ours))
+        deviation = np.nan_to_num(rendering.deviation[name]).mean(-1)
+        row = [
+            (f"{name}: predicted", previews.preview_rgb(sensor, ours, exposure)),
+            ("its deviation x 5", previews.to_uint8(5.0 * deviation)),
+        ]
+        if sensor.is_polarization:
+            row += [("AoLP (hue), DoLP (value): predicted", previews.to_uint8(previews.preview_aolp(rendering.stokes[name])))]
+        rows.append(row)
+    return rows
 
 
 def _score_table(evaluation: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, list[str]]]]:
     modalities: Mapping[str, Mapping[str, Any]] = evaluation.get("modalities", {})
     keys = [key for key in _COLUMNS if any(key in scores for scores in modalities.values())]
-    table = [(name, [_shown(scores.get(key), _COLUMNS[key][1]) for key in keys]) for name, scores in modalities.items()]
+    table = [
+        (f"{name} (predicted)" if scores.get("predicted") else name, [_shown(scores.get(key), _COLUMNS[key][1]) for key in keys])
+        for name, scores in modalities.items()
+    ]
     return [_COLUMNS[key][0] for key in keys], table
 
 

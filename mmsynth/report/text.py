@@ -17,6 +17,9 @@ _COLUMNS = {
     "psnr_foreground_view_mean": "view mean",
     "ssim": "ssim",
     "psnr_truth": "truth [dB]",
+    "psnr_aligned": "aligned [dB]",
+    "psnr_aligned_free_gain": "free gain",
+    "within_2sd": "within 2 sd",
     "psnr_highlights": "highlights",
     "psnr_silhouettes": "silhouettes",
     "psnr_rest": "rest",
@@ -49,7 +52,10 @@ def score_text(scores: Mapping[str, Any]) -> str:
     keys = [k for k in _COLUMNS if k in told]
     lines = ["".join([f"{'modality':10s}"] + [f"{_COLUMNS[k]:>12s}" for k in keys])]
     for name, m in modalities.items():
-        lines.append("".join([f"{name:10s}"] + [f"{m[k]:12.3f}" if isinstance(m.get(k), float) else f"{'':12s}" for k in keys]))
+        label = f"{name} *" if m.get("predicted") else name
+        lines.append("".join([f"{label:10s}"] + [f"{m[k]:12.3f}" if isinstance(m.get(k), float) else f"{'':12s}" for k in keys]))
+    if any(m.get("predicted") for m in modalities.values()):
+        lines.append("*: predicted by a prior, not measured; free gain: aligned, with the one gain that suits best")
     if "masks" in sources:
         lines.append("foreground: within the masks, dB of the error pooled over all views; view mean: the mean of dB over views")
     if "opacity" in sources:

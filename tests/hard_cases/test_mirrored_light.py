@@ -14,6 +14,7 @@ from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Lamps, Measured, Mirrors, Sampling
 from mmsynth.field.kernels.mirroring import reflect
+from mmsynth.field.light import LAMPS, find_lamps
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.rendering import trace
 from mmsynth.field.surface import Surface
@@ -153,6 +154,28 @@ def test_a_highlight_brighter_than_full_scale_asks_for_nothing_more(row: Row) ->
     usual = mirrored * level - target
     assert float(usual[0]) == pytest.approx(3.0) and float(ours[0]) == 0.0 and float(ours[1]) == pytest.approx(-0.6)
     row("a highlight of four times full scale", f"residual {float(usual[0]):.0f}", "0")
+
+
+def test_a_lamp_that_the_first_look_misses(row: Row) -> None:
+    """On a rough surface, 30° beside two strong lamps is still brighter than at a weak one: what is found there takes its place."""
+    g = torch.Generator().manual_seed(0)
+    lamps = normalize(torch.tensor([[1.0, 0.0, 0.0], [-0.17, 0.985, 0.0], [-0.5, -0.6, 0.6]]), dim=1)
+    normals, viewers = (normalize(torch.randn(20000, 3, generator=g), dim=1) for _ in range(2))
+    viewers = torch.where((viewers * normals).sum(1, keepdim=True) < 0, -viewers, viewers)
+    reflected = 2.0 * (viewers * normals).sum(1, keepdim=True) * normals - viewers
+    each = reflect(100.0 * lamps, _mirrors(normals, viewers, (1.0, 0.0, 30.0))).amount * torch.tensor([1.0, 1.0, 0.4])
+    light, strong = each.sum(1), lamps[:2]
+    first, masked = find_lamps(reflected, light), find_lamps(reflected, light, light, strong)
+    ours = find_lamps(reflected, light, each[:, 2], strong)
+    off = lambda found: math.degrees(math.acos(float((found @ lamps[2]).max())))
+    assert len(first) == LAMPS and off(first) > 60 and float((first @ strong.T).amax(0).min()) > math.cos(math.radians(10.0))
+    assert len(masked) == LAMPS - 2 and off(masked) > 60
+    assert len(ours) == 1 and off(ours) < 8
+    row(
+        "a weak lamp beside two strong ones, roughness 0.7",
+        f"one look: {len(first)} directions, {off(first):.0f}° off; again, in all light away from the strong ones: {off(masked):.0f}°",
+        f"again, in what the strong ones do not explain: {off(ours):.0f}° off, and none but it",
+    )
 
 
 @pytest.mark.parametrize("way", ["fused", "single operations"])

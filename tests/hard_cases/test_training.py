@@ -1,4 +1,4 @@
-"""Hard cases of a fit: numbers that are not finite, a killed run, sharpness, grids that must open again."""
+"""Hard cases of a fit: numbers that are not finite, a killed run, sharpness, grids that must open again, rays that follow residuals."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from mmsynth.errors import DivergedError
 from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, reference
 from mmsynth.field.rendering import ball_interval
 from mmsynth.fitting import run as run_module
+from mmsynth.fitting.importance import RUN, Importance
 from mmsynth.fitting.measurements import draw
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -220,4 +221,56 @@ def test_a_grid_that_was_emptied_finds_the_scene_again(row: Row, scene: Scene, s
         f"an occupancy grid set to {'empty' if state == OUTSIDE else 'far from everything'}",
         f"nerfacc, opacity {opacity:.1g} in all cells: {samples} samples in 60 steps, so no gradient",
         "opens again within some steps",
+    )
+
+
+def _importance(residual: np.ndarray, evenly: float) -> Importance:
+    """Draws by the residuals of runs (N,), each of which was looked at often."""
+    importance = Importance({"rgb": RUN * len(residual)}, evenly)
+    for _ in range(60):
+        importance.learn("rgb", RUN * np.arange(len(residual)), residual)
+    importance.renew()
+    return importance
+
+
+def test_rays_that_follow_residuals_do_not_move_the_minimum(row: Row) -> None:
+    """A picture, two of its 200 runs a highlight, explained by one number: the least squared error is at the mean, wherever rays go."""
+    random = np.random.default_rng(0)
+    seen = np.where(np.arange(200 * RUN) // RUN % 100 == 0, 8.0, 0.3) + 0.05 * random.normal(size=200 * RUN)
+    gradient = seen - seen.mean()  # of half the squared error, at the minimum: 0 on average
+    importance = _importance(np.abs(gradient).reshape(200, RUN).mean(1), 0.5)
+    pixel, weight = (x.reshape(2000, 400) for x in importance.draw("rgb", 2000 * 400, random))
+    usual, ours = gradient[pixel].mean(1), (weight * gradient[pixel]).mean(1)
+    even = gradient[random.integers(len(seen), size=(2000, 400))].mean(1)
+    bias = lambda steps: float(np.abs(steps.mean()) / (steps.std() / len(steps) ** 0.5))
+    assert bias(ours) < 4 and bias(even) < 4 and bias(usual) > 100
+    less = float(ours.std() / even.std())
+    assert less < 0.5
+    minimum = float((weight * seen[pixel]).sum() / weight.sum())
+    assert minimum == pytest.approx(seen.mean(), rel=0.01)
+    row(
+        f"1% of the pixels a highlight, the mean {seen.mean():.3f}",
+        f"drawn by residuals, not weighted, as instant-ngp: the minimum at {seen[pixel].mean():.2f}, {bias(usual):.0f} standard errors off",
+        f"weighted: at {minimum:.3f}, {bias(ours):.1f} standard errors, {less:.2f} times the noise of even draws",
+    )
+
+
+def test_rays_are_bounded_where_residuals_are_out_of_date(row: Row) -> None:
+    """A run that fitted well until now and does not any more: rays that were seldom drawn must not weigh the more for it."""
+    random = np.random.default_rng(1)
+    known = np.where(np.arange(200) % 100 == 0, 8.0, 0.002)
+    gradient = np.where(np.arange(200 * RUN) // RUN == 50, 1.0, 0.0)
+    even = gradient[random.integers(len(gradient), size=(2000, 400))].mean(1)
+    heaviest, noise = {}, {}
+    for evenly in (1e-6, 0.5):
+        pixel, weight = (x.reshape(2000, 400) for x in _importance(known, evenly).draw("rgb", 2000 * 400, random))
+        steps = (weight * gradient[pixel]).mean(1)
+        assert abs(steps.mean() - gradient.mean()) < 4 * steps.std() / len(steps) ** 0.5
+        heaviest[evenly], noise[evenly] = float(weight.max()), float(steps.std() / even.std())
+    assert heaviest[1e-6] > 10 and noise[1e-6] > 3
+    assert heaviest[0.5] <= 2.001 and noise[0.5] < 1.6
+    row(
+        "pixels that fitted well, and do not any more",
+        f"drawn in proportion to residuals, weighted: weights up to {heaviest[1e-6]:.0f}, {noise[1e-6]:.1f} times the noise of even draws",
+        f"half of the rays evenly: up to {heaviest[0.5]:.1f}, {noise[0.5]:.1f} times the noise",
     )

@@ -58,7 +58,8 @@ def convert_files(
     * ``NAME.npz``, ``.exr`` or ``.tiff`` (see ``records``): data (H, W, C) float32, opacity, valid, confidence, guided; polarization also
       stokes (H, W, 3) in this camera's x-axis frame; with ``as_sensor`` and a mosaic also raw (H, W), what its photosites measure;
     * ``NAME.png``: 16-bit preview, tone-mapped with one exposure for all views; for polarization S0, and ``NAME_dolp.png`` (grey)
-      and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``); ``NAME_confidence.png``;
+      and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``); ``NAME_confidence.png``. Of a
+      modality that a prior predicts all of them are ``NAME_predicted...``, and the arrays have a deviation (H, W, C);
     * ``NAME.json``: camera, method, exposure, conventions, hash; written last, so a view with a sidecar is complete.
 
     Args:
@@ -184,6 +185,7 @@ def _convert_each(
             "modality": target,
             "from": source,
             "method": made.method,
+            "predicted": made.deviation is not None,
             "frame_exposure": made.exposure,
             "guided": float(made.guided.mean()),
             "registration": item.registration,
@@ -200,18 +202,19 @@ def _convert_each(
 
 
 def _write_pictures(folder: Path, name: str, sensor: Sensor, made: Converted, exposure: float) -> list[Path]:
-    pictures = {f"{name}.png": previews.tone_map(previews.preview_linear(sensor, made.values), exposure)}
-    pictures[f"{name}_confidence.png"] = made.confidence
+    shown = name if made.deviation is None else f"{name}_predicted"
+    pictures = {f"{shown}.png": previews.tone_map(previews.preview_linear(sensor, made.values), exposure)}
+    pictures[f"{shown}_confidence.png"] = made.confidence
     if made.stokes is not None:
-        pictures[f"{name}_dolp.png"] = previews.preview_dolp(made.stokes)
-        pictures[f"{name}_aolp.png"] = previews.preview_aolp(made.stokes)
+        pictures[f"{shown}_dolp.png"] = previews.preview_dolp(made.stokes)
+        pictures[f"{shown}_aolp.png"] = previews.preview_aolp(made.stokes)
     for file, picture in pictures.items():
         write_png16(folder / file, picture)
     return [folder / file for file in pictures]
 
 
 def _arrays(sensor: Sensor, made: Converted, as_sensor: bool) -> dict[str, np.ndarray]:
-    arrays = modality_arrays(made.values, made.stokes)
+    arrays = modality_arrays(made.values, made.stokes, made.deviation)
     arrays |= {"opacity": made.opacity, "valid": made.valid, "confidence": made.confidence, "guided": made.guided}
     if as_sensor and sensor.mosaic is not None:
         arrays["raw"] = photosites_of(made.values, sensor.mosaic)

@@ -51,6 +51,7 @@ class Converted:
             ray or the frame shows what the field does not have; of ``render_frame``, coverage.
         guided: (H, W) bool, where the frame contributed.
         exposure: of the source frame, in units of the frames that the field learned from. opacity, valid: of the rendering.
+        deviation: (H, W, K) of the rendering, where a prior predicts the target; else None.
     """
 
     method: Method
@@ -61,6 +62,7 @@ class Converted:
     exposure: float
     opacity: np.ndarray
     valid: np.ndarray
+    deviation: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -210,6 +212,7 @@ def render_frame(field: Field, rays: TrainingRays, view: PosedCamera, target: st
         exposure=1.0,
         opacity=seen.opacity,
         valid=seen.valid,
+        deviation=seen.deviation.get(target),
     )
 
 
@@ -241,6 +244,7 @@ def _corrected(
         exposure=guidance.exposure,
         opacity=seen.opacity,
         valid=seen.valid,
+        deviation=seen.deviation.get(target),
     )
 
 

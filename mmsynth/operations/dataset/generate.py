@@ -233,7 +233,7 @@ def _write_view(plan: Plan, index: int, renderings: Sequence[Rendering], followi
 
 def _write_modality(plan: Plan, index: int, name: str, rendering: Rendering, record_format: RecordFormat) -> dict[str, Any]:
     sensor, folder = plan.field.sensors[name], plan.out / view_folder(index)
-    arrays = modality_arrays(rendering.channels[name], rendering.stokes.get(name))
+    arrays = modality_arrays(rendering.channels[name], rendering.stokes.get(name), rendering.deviation.get(name))
     if plan.format != "mms-data":
         return write_record(folder, name, arrays, record_format, units=UNITS, sensor=sensor)
     frame = write_record(plan.out / "modalities" / name, f"{index:04d}", {"data": arrays.pop("data")}, "tiff", units=UNITS, sensor=sensor)

@@ -109,7 +109,9 @@ def plan_dataset(
         "rig": rig,
         "format": file_format,
         "outputs": list(wanted),
-        "modalities": {name: channels_to_json(field.sensors[name]) for name in names},
+        "modalities": {
+            name: channels_to_json(field.sensors[name]) | ({"predicted": True} if name in field.predicted else {}) for name in names
+        },
         "unit": field.unit,
         "conventions": CONVENTIONS,
         "versions": {"mmsynth": __version__} | {package: version(package) for package in ("numpy", "torch")},

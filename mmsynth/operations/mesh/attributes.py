@@ -187,7 +187,7 @@ def add_attributes(mesh: trimesh.Trimesh, field: Field, scene: Scene, cell: floa
         count(len(points[part]))
     values = {key: np.concatenate([part[key] for part in found]).astype(np.float32) for key in found[0]}
     mesh.vertex_attributes.update(values)
-    mesh.metadata["properties"] = _described(sensors, field.shines)
+    mesh.metadata["properties"] = _described(sensors, field.shines, field.predicted)
     visual: Any = mesh.visual
     visual.vertex_colors = _preview(sensors, values)
 
@@ -258,8 +258,8 @@ def _means(sums: _Sums, sensors: Sequence[Sensor], views: np.ndarray, residual: 
     return out
 
 
-def _described(sensors: Sequence[Sensor], shines: bool) -> dict[str, str]:
-    """Property → what it is: channel and wavelength."""
+def _described(sensors: Sequence[Sensor], shines: bool, predicted: Sequence[str]) -> dict[str, str]:
+    """Property → what it is: channel and wavelength, and whether a prior predicted it."""
     out: dict[str, str] = {}
     for sensor in sensors:
         if sensor.is_polarization:
@@ -275,6 +275,8 @@ def _described(sensors: Sequence[Sensor], shines: bool) -> dict[str, str]:
             out[f"{sensor.name}_{i}"] = f"channel {label}{at}, linear, 1 = full scale"
             if shines:
                 out[f"{sensor.name}_base_{i}"] = f"channel {label}{at}, without the images of lamps, linear, 1 = full scale"
+    for name in predicted:
+        out |= {key: f"{said}, predicted by a prior" for key, said in out.items() if key.startswith(f"{name}_")}
     if shines:
         out |= {"roughness": "roughness of the mirror, alpha of GGX, 0 to 1", "strength": "height of a highlight in units of the lamp"}
     return out | {

@@ -1,6 +1,7 @@
 """Named arrays of one picture as files, and back: npz, OpenEXR or TIFF.
 
 A *record* is what belongs together: a modality (``data`` (H, W, C), for polarization also ``stokes`` (H, W, 3)), the geometry of a view.
+Of a modality that a prior predicted and no sensor measured it also has ``deviation`` (H, W, C), and what is said of it has ``predicted``.
 
 * npz: one file, every array as it is; channel names, wavelengths_nm (NaN = none) and polarizer_angles_deg beside the data.
 * exr: one file of float channels. Data are named as in the spectral layout of Fichet, Pacanowski and Wilkie ("An OpenEXR Layout for
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 RecordFormat = Literal["npz", "exr", "tiff"]
 RECORD_FORMATS: tuple[RecordFormat, ...] = get_args(RecordFormat)
-UNITS = {"data": "full scale", "stokes": "full scale", "raw": "full scale", "flow": "px"}
+UNITS = {"data": "full scale", "stokes": "full scale", "deviation": "full scale", "raw": "full scale", "flow": "px"}
 
 _PARTS = {
     "stokes": ("S0", "S1", "S2"),
@@ -44,6 +45,7 @@ _PARTS = {
 def field_hash(field: Field) -> str:
     """SHA-256 over the parameters and the rendering settings: two fields with one hash render the same."""
     digest = hashlib.sha256(repr(getattr(field, "sampling", None)).encode())
+    digest.update(repr(field.manifest.get("prior")).encode() if field.predicted else b"")
     for name, tensor in sorted(field.state_dict().items()):
         value = tensor.detach().cpu().contiguous().numpy()
         digest.update(f"{name} {value.dtype} {value.shape}".encode())
@@ -51,9 +53,10 @@ def field_hash(field: Field) -> str:
     return digest.hexdigest()
 
 
-def modality_arrays(values: np.ndarray, stokes: np.ndarray | None) -> dict[str, np.ndarray]:
-    """The record of one modality: data (H, W, C) float32 and, for polarization, stokes (H, W, 3)."""
-    return {"data": values.astype(np.float32)} | ({} if stokes is None else {"stokes": stokes.astype(np.float32)})
+def modality_arrays(values: np.ndarray, stokes: np.ndarray | None, deviation: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """The record of one modality: data (H, W, C) float32, for polarization stokes (H, W, 3), of a predicted one deviation (H, W, C)."""
+    given = {"data": values, "stokes": stokes, "deviation": deviation}
+    return {key: array.astype(np.float32) for key, array in given.items() if array is not None}
 
 
 def write_record(
@@ -71,11 +74,12 @@ def write_record(
         arrays: (H, W) or (H, W, K) by name. units: of the arrays, by name; those not in it are pure numbers. sensor: of ``data``.
     Returns:
         per file name: record, sha256, bytes, and per array shape, dtype, unit and, in exr, the names of its channels; channel names,
-        wavelengths and analyser angles of ``data``.
+        wavelengths and analyser angles of ``data``, and whether it was predicted.
     Raises:
         InputError: the disk refused.
     """
-    facts = {} if sensor is None else channels_to_json(sensor)
+    predicted = "deviation" in arrays
+    facts = {} if sensor is None else channels_to_json(sensor) | ({"predicted": True} if predicted else {})
 
     def entry(path: Path, keys: Mapping[str, str], channels: Mapping[str, list[str]] | None = None) -> dict[str, Any]:
         described = {
@@ -89,7 +93,7 @@ def write_record(
     own = {key: str(array.dtype) for key, array in arrays.items()}
     if file_format == "npz":
         path = folder / f"{stem}.npz"
-        write_npz(path, {**arrays, **_labels_of(sensor)})
+        write_npz(path, {**arrays, **_labels_of(sensor), **({"predicted": np.array(True)} if predicted else {})})
         return {path.name: entry(path, own)}
     if file_format == "exr":
         path = folder / f"{stem}.exr"

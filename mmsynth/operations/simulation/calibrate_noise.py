@@ -102,7 +102,11 @@ def calibrate_noise(
     Raises:
         InputError: unknown modality, or no frames of one.
     """
-    names = field.check_modalities(None if modalities is None else [canonical_modality(m) for m in modalities])
+    names = field.check_modalities(field.measured if modalities is None else [canonical_modality(m) for m in modalities])
+    for name in names:
+        if name in field.predicted:
+            others = ", ".join(field.measured)
+            raise InputError(f"calibrate-noise: {name} is predicted by a prior, no sensor measured it; expected one of {others}.")
     chosen = {name: _frames(scene, name, raw, views) for name in names}
     count = Counter(progress, sum(f.camera.width * f.camera.height for frames in chosen.values() for f, _ in frames))
     calibrated, failed = {}, {}

@@ -61,6 +61,10 @@ def _instance(field: Field, file: SensorFile, path: Path, delta: bool) -> Simula
     name = canonical_modality(file.instance_of or "")
     if name not in field.sensors:
         raise InputError(f"{path}: instance_of: {file.instance_of!r} is not in this field, expected one of {', '.join(field.sensors)}.")
+    if name in field.predicted:
+        raise InputError(
+            f"{path}: instance_of: {name} is predicted by a prior, no sensor measured it; expected one of {', '.join(field.measured)}."
+        )
     captured = field.sensors[name]
     stated = [c.label for c in file.channels]
     if stated and stated != list(captured.channels):

@@ -172,7 +172,7 @@ def _write(
     for k, (p, i, view) in enumerate(frames):
         name = p.sensor.name
         path, sidecar = out / "modalities" / name / f"{i:04d}.{file_format}", out / "sidecars" / name / f"{i:04d}.json"
-        facts = _facts(p, view, i, seed, digest)
+        facts = _facts(p, view, i, seed, digest, field.predicted)
         finished = _finished(sidecar, facts, path)
         if k not in mine:
             complete &= finished
@@ -194,7 +194,7 @@ def _ids(names: Sequence[str]) -> list[int]:
     return numbers if len(numbers) == len(names) == len(set(numbers)) else list(range(len(names)))
 
 
-def _facts(planned: SimulatedSensor, view: PosedCamera, frame: int, seed: int, digest: str) -> dict[str, Any]:
+def _facts(planned: SimulatedSensor, view: PosedCamera, frame: int, seed: int, digest: str, predicted: Sequence[str]) -> dict[str, Any]:
     return {
         "sensor": json.loads(planned.file.model_dump_json(exclude_defaults=True)),
         "kind": planned.file.kind,
@@ -204,6 +204,7 @@ def _facts(planned: SimulatedSensor, view: PosedCamera, frame: int, seed: int, d
         "stages": list(STAGES),
         "in_the_field": list(IN_THE_FIELD) if planned.file.kind == "instance" else [],
         "analysers": "of the file" if planned.polarized else "of the field" if planned.sensor.is_polarization else None,
+        "predicted": [name for name in planned.modalities if name in predicted],
         "channels_made_of": {
             label: {"residual": c.residual, "noise_gain": c.noise_gain, "weights": c.weights.tolist()}
             for label, c in planned.combinations.items()
