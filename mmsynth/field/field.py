@@ -20,7 +20,7 @@ from mmsynth.field.light import Light, mean_spectrum, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
-from mmsynth.prior.prediction import Predicted, Prediction
+from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, ray_map
@@ -243,7 +243,7 @@ class Field(nn.Module):
         polarized = any(self.sensors[name].is_polarization for name in wanted)
         needed = list(dict.fromkeys([*measured, *prediction.facts.known]))
         out = self._shade(hits, origins, directions, camera_x, needed, geometry or polarized, True)
-        found = self._predict(prediction, out, directions, camera_x, polarized)
+        found = prediction(self.seen(out, origins, directions, camera_x, polarized))
         for name in wanted:
             out[name], out[f"deviation/{name}"], out[f"mirrored/{name}"] = found[name].light, found[name].deviation, found[name].images
             stokes, of_lamps = found[name].stokes, found[name].images_s0
@@ -256,22 +256,26 @@ class Field(nn.Module):
         """The modalities that a prior predicts."""
         return [] if self.prediction is None else list(self.prediction.sensors)
 
-    def _predict(
-        self, prediction: Prediction, seen: dict[str, Tensor], directions: Tensor, camera_x: Tensor, polarized: bool
-    ) -> dict[str, Predicted]:
-        """Of rays that show what ``_shade`` found of them."""
-        zero = torch.zeros_like(seen["opacity"])
+    @property
+    def corrected(self) -> list[str]:
+        """The predicted modalities of which the scene has frames."""
+        return [] if self.prediction is None else list(self.prediction.corrections)
+
+    def seen(self, out: dict[str, Tensor], origins: Tensor, directions: Tensor, camera_x: Tensor, polarized: bool) -> Seen:
+        """What rays show that a prior predicts from, of what ``render_rays`` found with ``light`` and, if ``polarized``, geometry."""
+        zero = torch.zeros_like(out["opacity"])
         shapes = None
         if polarized:
-            met = torch.isfinite(seen["normal"]).all(1)
+            met = torch.isfinite(out["normal"]).all(1)
             x, y = reference_axes(directions, camera_x)
-            gloss = [torch.where(met & torch.isfinite(seen.get(key, zero)), seen.get(key, zero), zero) for key in ("roughness", "strength")]
-            shapes = shapes_of(torch.where(met[:, None], seen["normal"], -directions), directions, x, y, *gloss)
-        images = seen.get("images", torch.zeros_like(directions))
-        return prediction({name: self.body_of(name, seen) for name in prediction.facts.known}, images, shapes)
+            gloss = [torch.where(met & torch.isfinite(out.get(key, zero)), out.get(key, zero), zero) for key in ("roughness", "strength")]
+            shapes = shapes_of(torch.where(met[:, None], out["normal"], -directions), directions, x, y, *gloss)
+        far = torch.where(torch.isfinite(out["depth"]), out["depth"], torch.full_like(zero, rendering.FARTHEST))
+        body = {name: self.body_of(name, out) for name in self.measured if name in out}
+        return Seen(body, out.get("images", torch.zeros_like(directions)), shapes, origins + directions * far[:, None])
 
     def body_of(self, name: str, seen: dict[str, Tensor]) -> Tensor:
-        """Light without the images of lamps, (R, C), of a polarization modality S0, (R, 1), of what ``render_rays`` found with ``light``."""
+        """Light without the images of lamps (R, C), of polarization S0 (R, 1), of what ``render_rays`` found with ``light``."""
         if self.sensors[name].is_polarization:
             s0 = seen[f"stokes/{name}"][:, :1]
             return s0 - seen[f"mirrored_s0/{name}"][:, None] if self.shines else s0

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
 
 from mmsynth.field.field import TILE, Field
 from mmsynth.field.light import mean_spectrum
+from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import SceneSamples, Shapes, shapes_of
 from mmsynth.scene.exposure import Exposure
-from mmsynth.scene.scene import Frame
+from mmsynth.scene.images import load_frame
+from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import ray_map
+from mmsynth.sensors.mosaic import channel_map
 from mmsynth.sensors.polarization import reference_axes
 
 _RAYS = 24_576  # of all frames
@@ -59,6 +63,44 @@ def sample_field(field: Field, frames: Sequence[Frame], name: str, exposure: Exp
         polarized=None if polarized is None else seen[f"stokes/{polarized}"][:, 1:].double().numpy(),
         shapes=shapes,
     )
+
+
+def learn_from_frames(field: Field, prediction: Prediction, sensor: Sensor, frames: Sequence[Frame], *, seed: int = 0) -> Prediction:
+    """The prediction of a modality with what some frames of it add (``correction``); clipped photosites are passed over.
+
+    Raises:
+        InputError: a frame cannot be read.
+    """
+    random = np.random.default_rng(seed)
+    each = -(-_RAYS // len(frames))
+    found: dict[str, list[torch.Tensor]] = {}
+    for frame in frames:
+        pixels, _ = load_frame(sensor, frame)
+        values = pixels.reshape(pixels.shape[0] * pixels.shape[1], -1)
+        if sensor.mosaic is not None:
+            channels = channel_map(sensor.mosaic, *pixels.shape[:2]).reshape(-1, 1)
+        else:
+            channels = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+        in_camera, valid = ray_map(frame.camera)
+        usable = valid.reshape(-1, 1) & (values < sensor.saturation)
+        photosites = np.argwhere(usable)
+        photosites = photosites[np.sort(random.choice(len(photosites), min(each, len(photosites)), replace=False))]
+        pixel, k = photosites.T
+        for start in range(0, len(pixel), TILE):
+            rows = slice(start, start + TILE)
+            origins, directions, camera_x = field.rays_of(in_camera.reshape(-1, 3)[pixel[rows]], field.pose_of(frame))
+            out = field.render_rays(origins, directions, camera_x, list(prediction.facts.known), geometry=True, light=True)
+            seen = field.seen(out, origins, directions, camera_x, True)
+            numbers = {"channel": torch.from_numpy(channels[pixel[rows], k[rows]].astype(np.int64))}
+            numbers["measured"] = torch.from_numpy(values[pixel[rows], k[rows]].astype(np.float32))
+            of_shapes = {} if seen.shapes is None else {f"shapes/{f.name}": getattr(seen.shapes, f.name) for f in fields(Shapes)}
+            of_body = {f"body/{name}": light for name, light in seen.body.items()}
+            for key, value in {**numbers, **of_shapes, **of_body, "images": seen.images, "position": seen.position}.items():
+                found.setdefault(key, []).append(value.cpu())
+    joined = {key: torch.cat(values) for key, values in found.items()}
+    of = lambda prefix: {key.removeprefix(prefix): value for key, value in joined.items() if key.startswith(prefix)}
+    rays = Seen(of("body/"), joined["images"], Shapes(**of("shapes/")), joined["position"])
+    return prediction.corrected(sensor.name, rays, joined["channel"], joined["measured"], len(frames))
 
 
 @torch.no_grad()

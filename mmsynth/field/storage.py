@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from mmsynth.field.field import Corrections, Design, Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import read_json, sha256_of, write_atomic, write_json
+from mmsynth.prior.correction import Correction
 from mmsynth.prior.prediction import SceneFacts, predict
 from mmsynth.prior.prior import load_prior, save_prior
 from mmsynth.scene.scene import Region
@@ -23,6 +24,7 @@ from mmsynth.scene.serialisation import camera_from_json, camera_to_json, sensor
 
 FORMAT = 2  # of the run folder; 1 had none and other names
 PRIOR_FILE = "prior.safetensors"  # in it, of a field that predicts modalities
+CORRECTIONS_FILE = "corrections.safetensors"  # what frames of these add
 
 
 def save_field(field: Field, run: Path) -> None:
@@ -32,11 +34,16 @@ def save_field(field: Field, run: Path) -> None:
     write_atomic(run / "field.safetensors", lambda path: path.write_bytes(content))
     if field.prediction is not None:
         save_prior(field.prediction.prior, run / PRIOR_FILE)
+        more = {f"{name}.{key}": t for name, c in field.prediction.corrections.items() for key, t in c.tensors().items()}
+        if more:
+            corrections = save(more)
+            write_atomic(run / CORRECTIONS_FILE, lambda path: path.write_bytes(corrections))
         field.manifest["prior"] = {
             "sha256": sha256_of(run / PRIOR_FILE),
             "scenes": list(field.prediction.prior.scenes),
             "predicted": [sensor_to_json(s) for s in field.prediction.sensors.values()],
             "facts": asdict(field.prediction.facts),
+            "corrections": {name: correction.about() for name, correction in field.prediction.corrections.items()},
         }
     field.manifest["format"] = FORMAT
     field.manifest["field"] = {
@@ -77,7 +84,12 @@ def load_field(run: Path, device: str = "cpu") -> Field:
         field.load_state_dict(load_file(run / "field.safetensors"))
         if "prior" in manifest:
             facts = SceneFacts.from_json(manifest["prior"]["facts"])
-            field.predict(predict(load_prior(run / PRIOR_FILE), facts, field.measured))
+            prediction = predict(load_prior(run / PRIOR_FILE), facts, field.measured)
+            about = manifest["prior"]["corrections"]
+            tensors = load_file(run / CORRECTIONS_FILE) if about else {}
+            corrections = {name: Correction.from_parts(stated, name, tensors) for name, stated in about.items()}
+            sensors = {s["name"]: sensor_from_json(s) for s in manifest["prior"]["predicted"]}
+            field.predict(replace(prediction, sensors=sensors, corrections=corrections))
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: not the manifest of a fit of this version ({error}).") from error
     except (OSError, SafetensorError, RuntimeError) as error:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from mmsynth.field.field import Field
-from mmsynth.field.samples import sample_field
+from mmsynth.field.samples import learn_from_frames, sample_field
 from mmsynth.field.storage import save_field
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_text
@@ -29,7 +29,7 @@ from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.prior.prediction import common, predict, scene_facts
 from mmsynth.prior.prior import Prior
 from mmsynth.scene.exposure import Exposure, stated_exposure
-from mmsynth.scene.scene import Scene
+from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.scene.serialisation import CONVENTIONS, source_to_json
 from mmsynth.version import __version__
 
@@ -78,7 +78,9 @@ def fit(
         common(prior, scene.sensors)
     if device == "cpu":
         warm_up()
-    trainer = Trainer(scene, recipe if isinstance(recipe, Recipe) else load_recipe(recipe), steps, budget, seed, device)
+    recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+    taught = scene if prior is None else _without_sparse(scene, prior, recipe)
+    trainer = Trainer(taught, recipe, steps, budget, seed, device)
     log: list[str] = []
     if saved is not None:
         trainer.restore(saved)
@@ -111,7 +113,7 @@ def fit(
             last_saved = time.perf_counter()
     _save(run, trainer, log)
     field = _finished(trainer)
-    field.manifest = _manifest(trainer, scene)
+    field.manifest = _manifest(trainer, taught)
     if prior is not None:
         _predict(field, scene, prior, exposure)
     save_field(field, run)
@@ -119,23 +121,39 @@ def fit(
 
 
 def _predict(field: Field, scene: Scene, prior: Prior, exposure: Exposure) -> None:
-    """Let the field know what the prior says of modalities that the scene lacks, and the manifest, what that is."""
+    """Let the field know what the prior says of modalities that the scene lacks or has few frames of, and the manifest, what that is."""
+    began = time.perf_counter()
     frames = scene.frames_of(field.measured[0], scene.split.train)
     error = {name: 10.0 ** (-psnr / 20.0) for name, psnr in field.manifest["train_psnr"].items()}
-    began = time.perf_counter()
-    facts = scene_facts(prior, sample_field(field, frames, scene.root.name, exposure), error)
-    prediction = predict(prior, facts, field.measured)
+    prediction = predict(prior, scene_facts(prior, sample_field(field, frames, scene.root.name, exposure), error), field.measured)
+    needs = field.manifest["needs"]["choices"]
     if not prediction.sensors:
-        why = f"the scene has all modalities that the prior of {len(prior.scenes)} scenes knows"
-        field.manifest["needs"]["choices"]["prior"] = asdict(switch(False, why))
+        needs["prior"] = asdict(switch(False, f"the scene has all modalities that the prior of {len(prior.scenes)} scenes knows"))
         return
-    field.predict(prediction)
-    levels = f"; levels of {', '.join(facts.free)} are what is usual, as no exposure is stated" if facts.free else ""
-    why = (
-        f"{', '.join(prediction.sensors)} predicted from {', '.join(facts.known)}, by {len(prior.scenes)} scenes; "
-        f"the lamps' colour by {facts.how}{levels}; took {time.perf_counter() - began:.1f} s"
-    )
-    field.manifest["needs"]["choices"]["prior"] = asdict(switch(True, why))
+    taught = [name for name in prediction.sensors if name in scene.sensors]
+    for name in taught:
+        prediction = learn_from_frames(field, prediction, scene.sensors[name], scene.frames_of(name, scene.split.train))
+        field.cameras[name] = scene.frames_of(name)[0].camera
+    field.predict(replace(prediction, sensors=prediction.sensors | {name: scene.sensors[name] for name in taught}))
+    field.rig = rig_of(scene) | field.rig if taught else field.rig
+    facts, corrections = prediction.facts, prediction.corrections
+    why = f"{', '.join(prediction.sensors)} predicted from {', '.join(facts.known)}, by {len(prior.scenes)} scenes; "
+    why += f"the lamps' colour by {facts.how}"
+    free = [name for name in facts.free if name not in taught]
+    if free:
+        why += f"; levels of {', '.join(free)} are what is usual, as no exposure is stated"
+    for name, c in corrections.items():
+        why += f"; {name}: error at its {c.frames} frame{'s' * (c.frames != 1)} {c.before:.3f} without them, {c.after:.3f} with them"
+    needs["prior"] = asdict(switch(True, f"{why}; took {time.perf_counter() - began:.1f} s"))
+
+
+def _without_sparse(scene: Scene, prior: Prior, recipe: Recipe) -> Scene:
+    """The scene without modalities of so few frames that a prior knows more of them than a fit would."""
+    counts = {name: sum(f.camera.width * f.camera.height for f in scene.frames_of(name, scene.split.train)) for name in scene.sensors}
+    enough = recipe.sampling.sparse_below * max(counts.values())
+    known = [name for name in common(prior, scene.sensors) if 0 < counts[name] < enough]
+    sensors = {name: sensor for name, sensor in scene.sensors.items() if name not in known}
+    return replace(scene, sensors=sensors, frames=tuple(f for f in scene.frames if f.sensor in sensors)) if known else scene
 
 
 def _save(run: Path, trainer: Trainer, log: list[str]) -> None:

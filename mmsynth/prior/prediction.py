@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
-from mmsynth.prior.polarization import Polarization, inputs_of
+from mmsynth.prior.correction import Correction, choose_points, gain_of, learn, places_of
+from mmsynth.prior.polarization import inputs_of
 from mmsynth.prior.prior import Prior, described, lamp_unit
 from mmsynth.prior.samples import SceneSamples, Shapes, columns_of
 from mmsynth.prior.spectra import SpectralMap, White, spectral_map, white_of
@@ -65,72 +66,142 @@ class Predicted:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """What a field shows along R rays.
+
+    Attributes:
+        body: per known modality, light without the images of lamps, (R, C), of polarization S0, (R, 1); 1.0 = full scale.
+        images: (R, 3) Stokes vectors of the images of lamps, in units of their mean spectrum.
+        shapes: of the surfaces met, None: polarization is that of lamps alone. position: (R, 3) of these, normalised frame.
+    """
+
+    body: Mapping[str, Tensor]
+    images: Tensor
+    shapes: Shapes | None
+    position: Tensor
+
+
+@dataclass(frozen=True)
 class Prediction:
     """A prior, made ready for one scene.
 
     Attributes:
-        sensors: the predicted modalities. facts: of the scene.
+        sensors: the predicted modalities. facts: of the scene. corrections: what frames of them add, by modality.
     """
 
     sensors: dict[str, Sensor]
     facts: SceneFacts
     prior: Prior
-    _map: SpectralMap
-    _given: np.ndarray
-    _wanted: np.ndarray
+    spectra: SpectralMap
+    given: np.ndarray
+    wanted: np.ndarray
+    corrections: dict[str, Correction] = field(default_factory=dict)
 
-    def __call__(self, body: Mapping[str, Tensor], images: Tensor, shapes: Shapes | None) -> dict[str, Predicted]:
-        """Predict every modality along R rays.
-
-        Args:
-            body: per known modality, light without the images of lamps, (R, C), of polarization S0, (R, 1). images: (R, 3) Stokes vectors of
-                the images of lamps, in units of their mean spectrum. shapes: of the surfaces met, None: polarization is that of lamps alone.
-        """
-        columns, facts = columns_of(self.prior.sensors), self.facts
-        given = torch.cat([body[name].clamp(min=0.0) for name in facts.known], 1)
-        value, deviation = self._map(given)
-        of_field = (given.new_tensor(facts.error)[:, None] / self._map.known[:, None] * self._map.linear * self._map.wanted).square().sum(0)
-        of_white = given.new_tensor(facts.white_deviation)[self._wanted]
-        white = torch.exp(given.new_tensor(facts.white))
-        whole = given.new_empty(len(given), len(white))
-        whole[:, self._given], whole[:, self._wanted] = given, value
-        deviations = whole.new_zeros(whole.shape)
-        deviations[:, self._wanted] = torch.sqrt(deviation.square() + of_field + (value * of_white).square())
-        of_lamps = images[:, :1] * facts.lamp * white
+    def __call__(self, seen: Seen) -> dict[str, Predicted]:
+        """Predict every modality along R rays."""
+        facts, columns = self.facts, columns_of(self.prior.sensors)
+        given, reflected, places = self._known(seen)
+        mean = reflected.mean(1, keepdim=True)
+        value, paint = self.spectra(given)
+        error = given.new_tensor(facts.error)
+        of_field = (error[:, None] / self.spectra.known[:, None] * self.spectra.linear * self.spectra.wanted).square().sum(0)
+        white, of_white = torch.exp(given.new_tensor(facts.white)), given.new_tensor(facts.white_deviation)
         out = {}
         for name, sensor in self.sensors.items():
-            column = columns[name]
-            light, lamps = whole[:, column], of_lamps[:, column]
-            # as unsure as of white is one of the lamps, too
-            spread = torch.sqrt(deviations[:, column].square() + (lamps * given.new_tensor(facts.white_deviation)[column]).square())
+            column, at, correction = columns[name], self._at(name), self.corrections.get(name)
+            light, spread, level = value[:, at], paint[:, at], of_white[column]
+            lamps = seen.images * facts.lamp
+            more = unsure = None
+            if correction is not None:
+                more, unsure = correction(places)
+                count = light.shape[1]
+                light = (correction.gain * light + mean * white[column] * more[:, :count]).clamp(min=0.0)
+                lamps, spread, level = correction.gain * lamps, spread * unsure[:, :count], torch.zeros_like(level)
+            of_lamps = lamps[:, :1] * white[column]
+            deviation = torch.sqrt(spread.square() + of_field[at] + ((light + of_lamps) * level).square())
             if not sensor.is_polarization:
-                out[name] = Predicted(light + lamps, spread, lamps)
+                out[name] = Predicted(light + of_lamps, deviation, of_lamps)
                 continue
-            reflected = whole / white / facts.level
-            q, q_deviation = self._polarization(reflected, images[:, 0] * facts.lamp / facts.level, shapes)
-            s0 = light[:, 0] + lamps[:, 0]
-            polarized = images[:, 1:] * facts.lamp * white[column]
-            polarized = polarized + (s0 * q)[:, None] * (torch.zeros_like(polarized) if shapes is None else shapes.turn)
-            much = torch.linalg.vector_norm(polarized, dim=1)
-            polarized = polarized * torch.where(much > s0, s0 / much, torch.ones_like(s0))[:, None]
-            stokes = torch.cat([s0[:, None], polarized], 1)
-            assert sensor.polarizer_angles_deg is not None
-            # I = (S0 + S1 cos 2a + S2 sin 2a) / 2
-            turned = 0.5 * torch.sqrt(spread.square() + (s0 * q_deviation)[:, None].square())
-            out[name] = Predicted(
-                stokes_to_intensities(stokes, sensor.polarizer_angles_deg),
-                turned.expand(-1, sensor.channel_count),
-                stokes_to_intensities(torch.cat([lamps, images[:, 1:] * facts.lamp * white[column]], 1), sensor.polarizer_angles_deg),
-                stokes,
-                lamps[:, 0],
-            )
+            whole = torch.empty(len(given), len(white), device=given.device)
+            whole[:, self.given], whole[:, self.wanted] = given, value
+            q, of_q = self._polarization(whole / white / facts.level, seen)
+            if more is not None and unsure is not None:
+                q, of_q = (q + more[:, -1]).clamp(-1.0, 1.0), of_q * unsure[:, -1]
+            out[name] = _polarized(sensor, light[:, 0], lamps * white[column], q, seen.shapes, deviation, of_q)
         return out
 
-    def _polarization(self, reflected: Tensor, images: Tensor, shapes: Shapes | None) -> tuple[Tensor, Tensor]:
-        net: Polarization | None = self.prior.polarization
-        if net is None or shapes is None:
-            return torch.zeros_like(images), torch.full_like(images, 0.1)
-        return net(inputs_of(reflected[:, self.prior.colour], images, shapes))
+    def _at(self, name: str) -> np.ndarray:
+        """Where the channels of a modality stand among the wanted."""
+        column = columns_of(self.prior.sensors)[name]
+        return np.flatnonzero((self.wanted >= column.start) & (self.wanted < column.stop))
+
+    def _known(self, seen: Seen) -> tuple[Tensor, Tensor, Tensor]:
+        """Light and reflected light of the known channels, (R, A), and places of the surfaces, (R, Z)."""
+        given = torch.cat([seen.body[name].clamp(min=0.0) for name in self.facts.known], 1)
+        reflected = given / self.spectra.known
+        return given, reflected, places_of(reflected, seen.position, self.facts.level)
+
+    def _polarization(self, reflected: Tensor, seen: Seen) -> tuple[Tensor, Tensor]:
+        net, images = self.prior.polarization, seen.images[:, 0] * self.facts.lamp / self.facts.level
+        if net is None or seen.shapes is None:
+            return torch.zeros_like(images), torch.full_like(images, _UNKNOWN_Q)
+        return net(inputs_of(reflected[:, self.prior.colour], images, seen.shapes))
+
+    def corrected(self, name: str, seen: Seen, channel: Tensor, measured: Tensor, frames: int) -> Prediction:
+        """With what N numbers add that were measured by the modality ``name`` along N rays.
+
+        Args:
+            channel: (N,) int64 of each number. measured: (N,), 1.0 = full scale. frames: that they are of.
+        """
+        column, at = columns_of(self.prior.sensors)[name], self._at(name)
+        _, reflected, places = self._known(seen)
+        found = self(seen)[name]
+        predicted = found.light.gather(1, channel[:, None])[:, 0]
+        gain = gain_of(predicted, measured, float(np.mean(self.facts.white_deviation[column])))
+        rest = measured - gain * predicted
+        white = torch.exp(torch.tensor(self.facts.white[column]))
+        level = reflected.mean(1)
+        sizes = self.spectra.base[at].sqrt()
+        points = choose_points(places)
+        angles = self.sensors[name].polarizer_angles_deg
+        if angles is not None and found.stokes is not None:
+            turned = torch.deg2rad(2.0 * torch.tensor(angles))[channel]
+            turn = torch.zeros(len(channel), 2) if seen.shapes is None else seen.shapes.turn
+            along = turn[:, 0] * torch.cos(turned) + turn[:, 1] * torch.sin(turned)
+            parts = 0.5 * torch.stack([level * white[0], found.stokes[:, 0] * along], 1)
+            weights, unknown, left = learn(points, places, parts, torch.cat([sizes, sizes.new_tensor([_UNSURE_Q])]), rest)
+        else:
+            of_channels = []
+            left = rest.clone()
+            for c in range(len(white)):
+                rows = channel == c
+                part = (level[rows] * white[c])[:, None]
+                *learned, left[rows] = learn(points, places[rows], part, sizes[c : c + 1], rest[rows])
+                of_channels.append(learned)
+            weights, unknown = (torch.cat(parts) for parts in zip(*of_channels, strict=True))
+        rms = lambda values: float(values.square().mean().sqrt())
+        made = Correction(gain, points, weights, unknown, frames, rms(measured - predicted), rms(left))
+        return replace(self, corrections={**self.corrections, name: made})
+
+
+_UNKNOWN_Q = 0.1  # deviation of q where nothing tells it
+_UNSURE_Q = 0.03  # by which materials of a scene differ from what the network expects
+
+
+def _polarized(sensor: Sensor, body: Tensor, lamps: Tensor, q: Tensor, shapes: Shapes | None, deviation: Tensor, of_q: Tensor) -> Predicted:
+    """S0 of the body (R,), Stokes vectors of the lamps' images (R, 3) and q (R,) → what a polarization sensor shows."""
+    assert sensor.polarizer_angles_deg is not None
+    s0 = body + lamps[:, 0]
+    polarized = lamps[:, 1:] if shapes is None else lamps[:, 1:] + (s0 * q)[:, None] * shapes.turn
+    much = torch.linalg.vector_norm(polarized, dim=1)
+    polarized = polarized * torch.where(much > s0, s0 / much, torch.ones_like(s0))[:, None]
+    stokes = torch.cat([s0[:, None], polarized], 1)
+    # I = (S0 + S1 cos 2a + S2 sin 2a) / 2
+    behind = 0.5 * torch.sqrt(deviation.square() + (s0 * of_q)[:, None].square())
+    angles = sensor.polarizer_angles_deg
+    return Predicted(
+        stokes_to_intensities(stokes, angles), behind.expand(-1, len(angles)), stokes_to_intensities(lamps, angles), stokes, lamps[:, 0]
+    )
 
 
 def scene_facts(prior: Prior, sample: SceneSamples, error: Mapping[str, float]) -> SceneFacts:

@@ -52,7 +52,7 @@ def open_run(folder: Path | None = None, *, device: str = "cpu", masks: MaskMean
         InputError: as ``open_field``, or the scene or its masks cannot be read.
     """
     folder, field = open_field(folder, device=device)
-    scene = load_again(field.manifest["scene"], modalities=field.measured, masks=masks, mask_folder=mask_folder)
+    scene = load_again(field.manifest["scene"], modalities=[*field.measured, *field.corrected], masks=masks, mask_folder=mask_folder)
     return Run(folder, field, scene)
 
 

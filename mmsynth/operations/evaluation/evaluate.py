@@ -15,8 +15,8 @@ averaged per view in dB):
   everywhere; both clipped to [0, 1], the range that frames can record.
 * ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
 * ``psnr_highlights, psnr_silhouettes, psnr_rest``: of ``psnr_aligned``, its parts (see ``parts``), where ``gt/geometry`` tells them.
-* ``psnr_aligned_free_gain``: of a predicted modality, ``psnr_aligned`` times the one gain that suits best, ``free_gain``; ``within_2sd``: the
-  share of pixels and channels whose error is below two of the deviations that were predicted.
+* ``psnr_aligned_free_gain``: of a predicted modality, ``psnr_aligned`` times the one gain that suits best, ``free_gain``; ``within_2sd``:
+  the share of pixels and channels whose error is below two of the deviations that were predicted.
 * ``sam``: mean angle between spectra, degrees (Kruse et al. 1993); ``stokes_rmse`` over S0, S1, S2; ``s1_s2_rmse``, beside
   ``s1_s2_unpolarized_rmse``, that of saying that nothing is polarized; ``dolp_rmse``, ``dolp_mae``; ``aolp_mae``:
   circular, degrees, weighted by the true polarised light S0 DoLP. In the region, at the RGB pose, else (without ``gt/aligned``)
