@@ -1,7 +1,9 @@
 """What a few frames of a modality add to its prediction.
 
-The prediction is the mean, and what frames add to it is a Gaussian process over the places of a scene (Rasmussen and Williams 2006, §2.2 and, for
-the inducing points, §8.3.2): y - k p = s f(z) + noise. p is the prediction, k one gain, s the mean reflected light of the surface times white, so
+The prediction is the mean, and what frames add to it is a Gaussian process over the places of a scene (Rasmussen and Williams 2006, §2.2
+and, for
+the inducing points, §8.3.2): y - k p = s f(z) + noise. p is the prediction, k one gain, s the mean reflected light of the surface times
+white, so
 that f is free of exposure. A place z is colour, brightness and position: two surfaces of one colour are likely one paint, and more likely
 so where they lie side by side; far from all frames f is 0, and the prediction stays. How large f may be is what the prior says of how much
 spectra differ: much for near infrared behind RGB, little for a panchromatic sensor. Of polarization S0 and q are corrected together:
@@ -57,7 +59,8 @@ class Correction:
     """Of one modality in C numbers: its channels, of polarization S0 and q.
 
     Attributes:
-        gain: k. points: (M, Z) places. weights: (C, M), f(z) = weights · covariance(points, z). unknown: (C, M, M), such that the variance of f
+        gain: k. points: (M, Z) places. weights: (C, M), f(z) = weights · covariance(points, z). unknown: (C, M, M), such that the
+            variance of f
             is 1 - k · unknown k of that before frames were seen, with k = covariance(points, z).
         frames: how many taught it. before, after: rms of the rows' error, predicted and corrected; 1.0 = full scale.
     """

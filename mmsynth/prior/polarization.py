@@ -1,6 +1,7 @@
 """Polarization from the shape of a surface and from what it looks like.
 
-Light that a surface sends out is polarized along the plane of view and normal or across it (Fresnel; Atkinson and Hancock 2006), but for the
+Light that a surface sends out is polarized along the plane of view and normal or across it (Fresnel; Atkinson and Hancock 2006), but for
+the
 images of lamps, which ``field.kernels.mirroring`` knows. How far and which way depends on material and surroundings, which nobody measured:
 a small network that many scenes have taught gives q, S1 over S0 about that plane, in [-1, 1], and its deviation. q > 0 is along the plane.
 """

@@ -28,7 +28,8 @@ class SceneFacts:
     Attributes:
         known: modalities that predictions are made of. white: log of what a white board shows in each of the prior's channels.
         white_deviation: of it. free: modalities whose gain nobody stated: their level is what is usual. how: where white is from.
-        level: mean of the scene's reflected light. lamp: a lamp's spectrum over white. error: of the field in each known channel, 1.0 = full
+        level: mean of the scene's reflected light. lamp: a lamp's spectrum over white. error: of the field in each known channel, 1.0 =
+            full
             scale.
     """
 
@@ -239,7 +240,8 @@ def common(prior: Prior, sensors: Mapping[str, Sensor]) -> list[str]:
     out = [n for n, sensor in sensors.items() if n in prior.sensors and channels_to_json(sensor) == channels_to_json(prior.sensors[n])]
     if not out:
         raise InputError(
-            f"prior: it knows {_listed(prior.sensors)}; the scene has {_listed(sensors)}; expected a modality with the same channels in both."
+            f"prior: it knows {_listed(prior.sensors)}; the scene has {_listed(sensors)}; "
+            f"expected a modality with the same channels in both."
         )
     return out
 

@@ -155,7 +155,8 @@ class SpectralMap:
     Attributes:
         known, wanted: (A,), (B,) what a white board shows there, 1.0 = full scale. linear: (A, B), of reflected light.
         chroma: (K, A) of clusters. residual, variance: (K, B) of what the linear map misses there, over the mean known channel, and
-            ``has``: (K, B), 1 where the cluster says something, times its share. base: (B,) variance over all clusters. shrink: clusters' worth.
+            ``has``: (K, B), 1 where the cluster says something, times its share. base: (B,) variance over all clusters. shrink:
+            clusters' worth.
     """
 
     known: Tensor
@@ -267,7 +268,8 @@ def _mean_and_deviation(log: np.ndarray) -> np.ndarray:
 
 
 def _line(log: np.ndarray) -> np.ndarray:
-    """(3, C): a, b and the deviation of log whites (scenes, C) from the line a + b t, t of variance 1; a is NaN where no gain was stated."""
+    """(3, C): a, b and the deviation of log whites (scenes, C) from the line a + b t, t of variance 1; a is NaN where no gain was
+    stated."""
     log = log[np.isfinite(log).any(1)]
     count = log.shape[1]
     if not len(log):

@@ -2,8 +2,8 @@
 
 ``{"rgb": 0.0061, "ms": 0.0168}`` states the gain of each modality: value = gain x radiance within the response, in any unit that is the
 same for all of them (exposure time x aperture x gain of the amplifier, say). ``{"white": {"rgb": [0.61, 0.44, 0.22], "ms": [...]}}`` states
-what a white (or grey) board under the scene's light shows in each channel of a modality: gain and lamp at once. Both may be there; names may
-be aliases. What is not stated is free: a prior then takes what is usual, and says so.
+what a white (or grey) board under the scene's light shows in each channel of a modality: gain and lamp at once. Both may be there; names
+may be aliases. What is not stated is free: a prior then takes what is usual, and says so.
 """
 
 from __future__ import annotations

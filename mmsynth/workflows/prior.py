@@ -28,7 +28,8 @@ def make_prior(
     """Learn a prior from runs, and from scenes, which are fitted first, and write it.
 
     Args:
-        sources: run folders or scenes, each with several modalities. budget, steps, device: of the fits of scenes, see ``fit``; their runs are
+        sources: run folders or scenes, each with several modalities. budget, steps, device: of the fits of scenes, see ``fit``; their
+            runs are
             in ``OUT's folder/prior_runs/SCENE`` and are taken again where they are finished. say: told one line a source.
     Raises:
         InputError: no sources, one that is neither run nor scene or has one modality, or the file cannot be written.
