@@ -32,7 +32,8 @@ from mmsynth.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from mmsynth.errors import DivergedError, InputError
-    from mmsynth.field.field import Field, Rendering
+    from mmsynth.field.field import Field
+    from mmsynth.field.picture import Rendering
     from mmsynth.fitting.recipe import Recipe, load_recipe
     from mmsynth.fitting.run import fit
     from mmsynth.operations.conversion.files import convert_files
@@ -57,7 +58,8 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "errors": "DivergedError InputError",
-    "field.field": "Field Rendering",
+    "field.field": "Field",
+    "field.picture": "Rendering",
     "fitting.recipe": "Recipe load_recipe",
     "fitting.run": "fit",
     "operations.conversion.files": "convert_files",

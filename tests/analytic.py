@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from conftest import look_at
 
-from mmsynth.field.field import Field, Rendering
+from mmsynth.field.field import Field
+from mmsynth.field.picture import Rendering
 from mmsynth.scene.image_writers import write_npz, write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera, ray_map
@@ -61,6 +62,8 @@ class AnalyticField:
         self.manifest: dict[str, Any] = {}
         self.sensors = {s.name: s for s in sensors}
         camera = Camera(24, 18, 26.0, 26.0, 11.3, 8.6, (-0.1, 0.05, 0.001, -0.002))
+        self.predicted: list[str] = []
+        self.measured = list(self.sensors)
         self.cameras = {s.name: camera for s in sensors}
         self.rig = {s.name: np.eye(4) for s in sensors}
         for i, s in enumerate(sensors):
@@ -144,6 +147,7 @@ class AnalyticField:
             image["normal"],
             np.nan_to_num(image["opacity"][..., 0]),
             valid.copy(),
+            {},
         )
 
 

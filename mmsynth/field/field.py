@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,14 @@ from torch import Tensor, nn
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
+from mmsynth.field.design import Corrections, Design
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.kernels.mirroring import material
 from mmsynth.field.light import Light, mean_spectrum, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
+from mmsynth.field.picture import Rendering
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
 from mmsynth.prior.prediction import Prediction, Seen
@@ -29,64 +31,6 @@ from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 TILE = 8192  # rays at a time: what they need stays in the caches
 MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """What a camera sees, all modalities at every pixel (H, W).
-
-    Attributes:
-        channels: per modality (H, W, C) float32, linear, 1.0 = the sensor's full scale; for a polarization modality the
-            intensities behind the sensor's analysers, in this camera's own frame.
-        stokes: per polarization modality (H, W, 3): S0, S1, S2 in this camera's x-axis frame.
-        depth_z, depth_ray: (H, W) float32 along the optical axis, along the ray; scene unit, NaN = no hit.
-        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit, or not asked for.
-        opacity: (H, W) float32 in [0, 1], of the region of interest; 0 where the surface met lies outside it.
-        valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
-        deviation: per modality that is predicted and was not measured (H, W, C), the standard deviation of its channels.
-    """
-
-    channels: dict[str, np.ndarray]
-    stokes: dict[str, np.ndarray]
-    depth_z: np.ndarray
-    depth_ray: np.ndarray
-    normal: np.ndarray
-    opacity: np.ndarray
-    valid: np.ndarray
-    deviation: dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Corrections:
-    """Rigid motions by which a fit found the input's poses to be off; scene unit.
-
-    Attributes:
-        views: by view id, (4, 4), applied in the world frame. sensors: by name, (4, 4), applied in the camera's axes.
-    """
-
-    views: dict[int, np.ndarray]
-    sensors: dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Design:
-    """The sizes of a field's parts: what a scene was found to need (see fitting.needs). Stored with the field."""
-
-    surface_levels: int = 8
-    surface_rows_log2: int | tuple[int, ...] = 16
-    surface_finest: int = 128
-    radiance_levels: int = 10
-    radiance_rows_log2: int | tuple[int, ...] = 16
-    radiance_finest: int = 256
-    background: bool = False
-    far_light: bool = False
-    light: bool = False
-    outer_radius: float = 1.9
-    surface_hidden: int = 32
-    radiance_hidden: int = 64
-    coarsest: int = 16
-    occupancy: int = 64
-    initial_radius: float = 0.5
 
 
 class Field(nn.Module):
@@ -235,11 +179,9 @@ class Field(nn.Module):
         light: bool = False,
     ) -> dict[str, Tensor]:
         """What rays show that met ``hits``: see ``render_rays``."""
-        measured = [name for name in modalities if name not in self.predicted]
-        if self.prediction is None or len(measured) == len(modalities):
+        wanted, measured = ([n for n in modalities if (n in self.predicted) == predicted] for predicted in (True, False))
+        if (prediction := self.prediction) is None or not wanted:
             return self._shade(hits, origins, directions, camera_x, measured, geometry, light)
-        prediction = self.prediction
-        wanted = [name for name in modalities if name in self.predicted]
         polarized = any(self.sensors[name].is_polarization for name in wanted)
         needed = list(dict.fromkeys([*measured, *prediction.facts.known]))
         out = self._shade(hits, origins, directions, camera_x, needed, geometry or polarized, True)

@@ -12,7 +12,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import Corrections, Design, Field
+from mmsynth.field.design import Corrections, Design
+from mmsynth.field.field import Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import read_json, sha256_of, write_atomic, write_json

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mmsynth.field.field import Design
+from mmsynth.field.design import Design
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import Recipe

@@ -12,7 +12,8 @@ from pydantic import TypeAdapter
 from torch import Tensor
 
 from mmsynth.field import kernels, rendering
-from mmsynth.field.field import Corrections, Field
+from mmsynth.field.design import Corrections
+from mmsynth.field.field import Field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements, in_order

@@ -123,7 +123,7 @@ class Prediction:
             if not sensor.is_polarization:
                 out[name] = Predicted(light + of_lamps, deviation, of_lamps)
                 continue
-            whole = torch.empty(len(given), len(white), device=given.device)
+            whole = given.new_zeros(len(given), len(white))
             whole[:, self.given], whole[:, self.wanted] = given, value
             q, of_q = self._polarization(whole / white / facts.level, seen)
             if more is not None and unsure is not None:
@@ -251,11 +251,14 @@ def _listed(sensors: Mapping[str, Sensor]) -> str:
 
 
 def predict(prior: Prior, facts: SceneFacts, measured: Sequence[str]) -> Prediction:
-    """Make a prior ready for a scene that has the modalities ``measured``: all others of the prior are predicted."""
+    """Make a prior ready for a scene that has the modalities ``measured``: all others that a scene of the prior had beside them are
+    predicted."""
     columns, indices = columns_of(prior.sensors), np.arange(len(prior.spectra.usual))
     given = np.concatenate([indices[columns[name]] for name in facts.known])
-    rest = np.setdiff1d(indices, given)
+    # of what no scene had beside the known, nothing is known
+    met = np.isfinite(prior.spectra.moments[given]).all(0)
+    rest = np.setdiff1d(indices[met], given)
     free = np.isin(indices, [i for name in facts.free for i in indices[columns[name]]])
     white = White(np.array(facts.white), np.array(facts.white_deviation), free, facts.how)
-    sensors = {name: sensor for name, sensor in prior.sensors.items() if name not in measured}
+    sensors = {name: sensor for name, sensor in prior.sensors.items() if name not in measured and met[columns[name]].all()}
     return Prediction(sensors, facts, prior, spectral_map(prior.spectra, white, given, rest), given, rest)

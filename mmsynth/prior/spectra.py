@@ -14,6 +14,7 @@ spread is the deviation.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -205,6 +206,10 @@ def spectral_map(spectra: Spectra, white: White, given: np.ndarray, wanted: np.n
     variance = np.where(says, spreads, 0.0)
     weight = says * spectra.share[usable][:, None]
     base = (weight * (residual**2 + variance)).sum(0) / np.maximum(weight.sum(0), 1e-12)
+    if not usable.any():  # no pixel of any scene was bright enough to have a colour: all that is known is what the linear map misses
+        nothing = np.zeros((1, len(wanted)))
+        chroma, residual, variance, weight = np.ones((1, len(given))), nothing, nothing, nothing
+        base = np.maximum(np.diag(spectra.moments)[wanted] - (linear * cross).sum(0), 0.0) * len(given) / np.trace(gram)
     tensor = lambda a: torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32))
     return SpectralMap(
         known=tensor(np.exp(white.log[given])),
@@ -298,7 +303,9 @@ def _clusters(reflected: np.ndarray, has: np.ndarray, count: int, random: np.ran
     place = np.sqrt(np.minimum(chroma[:, has], _BRIGHT))  # of equal noise at any brightness, about
     means, spreads, shares = [], [], []
     if len(chroma) >= _LEAST_PIXELS:
-        _, label = kmeans2(place, min(count, len(chroma) // _LEAST_PIXELS), minit="++", rng=random)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # fewer colours than clusters: some are empty
+            _, label = kmeans2(place, min(count, len(chroma) // _LEAST_PIXELS), minit="++", rng=random)
         for k in np.unique(label):
             of = label == k
             if of.sum() < _LEAST_PIXELS:

@@ -8,7 +8,6 @@ may be aliases. What is not stated is free: a prior then takes what is usual, an
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from mmsynth.files import read_json
 from mmsynth.scene.scene import Scene, canonical_modality
 
 FILE_NAME = "exposure.json"
+_MOST = 1e30
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ def read_exposure(path: Path) -> Exposure:
 
 
 def _positive(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
-        raise InputError(f"{where}: {value!r}, expected a positive number.")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < _MOST:
+        shown = value if len(repr(value)) < 40 else "a number of many digits"
+        raise InputError(f"{where}: {shown!r}, expected a positive number.")
     return float(value)

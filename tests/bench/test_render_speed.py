@@ -14,7 +14,8 @@ from conftest import look_at, ring
 from mmsynth.bench import render as bench
 from mmsynth.bench.render import FAMILIES, Rays, bench_render, difference, fine, rays_of, truth_of
 from mmsynth.errors import InputError
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
 from mmsynth.sensors.camera import Camera

@@ -9,7 +9,8 @@ import pytest
 
 from mmsynth.bench.twin import FAMILIES, bench_twin
 from mmsynth.errors import InputError
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.scene.scene import Region, Sensor
 from mmsynth.sensors.camera import Camera
 

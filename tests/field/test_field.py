@@ -17,7 +17,8 @@ from torch.nn.functional import normalize, softplus
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.field.kernels import intensity, radiance
 from mmsynth.field.light import Light
 from mmsynth.field.light_rendering import render_light

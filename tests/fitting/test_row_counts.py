@@ -9,8 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mmsynth.field.design import Design
 from mmsynth.field.encoding import HashGrid
-from mmsynth.field.field import Design, Field
+from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
 from mmsynth.fitting import run as run_module
 from mmsynth.fitting.recipe import Recipe

@@ -12,8 +12,9 @@ from torch.nn.functional import normalize, softplus
 from usual import nerfacc_keeps, neus_weights
 
 from mmsynth.field import kernels
+from mmsynth.field.design import Design
 from mmsynth.field.encoding import HashGrid
-from mmsynth.field.field import Design, Field
+from mmsynth.field.field import Field
 from mmsynth.field.kernels import OUTSIDE, SHELL, Hits, Rays, Sampling, reference
 from mmsynth.field.kernels.constants import MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cpu import marching

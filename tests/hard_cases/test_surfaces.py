@@ -11,7 +11,8 @@ import trimesh
 from skimage.measure import marching_cubes
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
 from mmsynth.scene.scene import Region, Sensor
 

@@ -33,7 +33,8 @@ from mmsynth.scene.scene import PosedCamera, Sensor, canonical_modality
 from mmsynth.sensors.camera import Camera, project, surface_points
 
 if TYPE_CHECKING:
-    from mmsynth.field.field import Field, Rendering
+    from mmsynth.field.field import Field
+    from mmsynth.field.picture import Rendering
 
 Method = Literal["auto", "field", "ratio", "guided"]
 METHODS: tuple[Method, ...] = get_args(Method)

@@ -56,7 +56,8 @@ from mmsynth.scene.layouts.nerfstudio import transforms_content
 from mmsynth.scene.scene import PosedCamera, Scene
 
 if TYPE_CHECKING:
-    from mmsynth.field.field import Field, Rendering
+    from mmsynth.field.field import Field
+    from mmsynth.field.picture import Rendering
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,8 @@ from mmsynth.sensors.mosaic import photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
 if TYPE_CHECKING:
-    from mmsynth.field.field import Field, Rendering
+    from mmsynth.field.field import Field
+    from mmsynth.field.picture import Rendering
 
 _FOREGROUND_SOURCES = ("masks", "gt", "opacity")
 

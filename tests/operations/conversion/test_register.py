@@ -15,7 +15,8 @@ from conftest import look_at
 from scipy.ndimage import map_coordinates
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.register import Landmarks, landmarks, register
 from mmsynth.scene.image_writers import write_png16

@@ -12,7 +12,8 @@ import torch
 from analytic import POL, RGB, AnalyticField, ring_pose, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.dataset.index import verify_dataset
 from mmsynth.operations.dataset.plan import DATASET_FORMATS

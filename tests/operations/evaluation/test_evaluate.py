@@ -12,7 +12,7 @@ import pytest
 from analytic import MS, RGB, AnalyticField, scene_of, sphere
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import Rendering
+from mmsynth.field.picture import Rendering
 from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim
 from mmsynth.report.text import score_text
 from mmsynth.scene.image_writers import write_png16

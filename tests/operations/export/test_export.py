@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from mmsynth.cli import app
 from mmsynth.errors import InputError
-from mmsynth.field.field import Corrections, Design, Field
+from mmsynth.field.design import Corrections, Design
+from mmsynth.field.field import Field
 from mmsynth.operations.export.export import export_scene
 from mmsynth.operations.export.plans import LAYOUTS, ExportLayout
 from mmsynth.scene.image_writers import write_npz, write_png, write_png16

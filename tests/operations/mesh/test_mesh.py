@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import Design, Field
+from mmsynth.field.design import Design
+from mmsynth.field.field import Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.operations.mesh.extract import Kept, MeshOptions, extract_mesh, settle
 from mmsynth.operations.mesh.marching import march, steepest

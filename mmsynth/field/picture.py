@@ -1,0 +1,32 @@
+"""What a camera sees of a field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera sees, all modalities at every pixel (H, W).
+
+    Attributes:
+        channels: per modality (H, W, C) float32, linear, 1.0 = the sensor's full scale; for a polarization modality the
+            intensities behind the sensor's analysers, in this camera's own frame.
+        stokes: per polarization modality (H, W, 3): S0, S1, S2 in this camera's x-axis frame.
+        depth_z, depth_ray: (H, W) float32 along the optical axis, along the ray; scene unit, NaN = no hit.
+        normal: (H, W, 3) float32, world frame, unit, outward, NaN = no hit, or not asked for.
+        opacity: (H, W) float32 in [0, 1], of the region of interest; 0 where the surface met lies outside it.
+        valid: (H, W) bool, False where the lens has no ray (all values are NaN or 0 there).
+        deviation: per modality that is predicted and was not measured (H, W, C), the standard deviation of its channels.
+    """
+
+    channels: dict[str, np.ndarray]
+    stokes: dict[str, np.ndarray]
+    depth_z: np.ndarray
+    depth_ray: np.ndarray
+    normal: np.ndarray
+    opacity: np.ndarray
+    valid: np.ndarray
+    deviation: dict[str, np.ndarray]
