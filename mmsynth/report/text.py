@@ -15,6 +15,7 @@ _COLUMNS = {
     "psnr_foreground": "foreground",
     "psnr_foreground_view_mean": "view mean",
     "ssim": "ssim",
+    "lpips": "lpips",
     "psnr_truth": "truth [dB]",
     "psnr_highlights": "highlights",
     "psnr_silhouettes": "silhouettes",
