@@ -160,6 +160,9 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
         command = [sys.executable, "-m", module, json.dumps(task), folder]
         path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, "PYTHONPATH": path}
+        # torchrun limits torch alone; numba would take all cores for each of the processes
+        if environment.get("OMP_NUM_THREADS", "").isdecimal():
+            environment.setdefault("NUMBA_NUM_THREADS", environment["OMP_NUM_THREADS"])
         # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
             status = process.wait()
