@@ -144,10 +144,10 @@ def load_experiments(names: Sequence[str] | None = None) -> dict[str, Experiment
 
 
 def fit_of(row: Row, scored: str, scene: Scene) -> Fit | None:
-    """The fit whose score of a modality stands in a row; None where the scene has no such.
+    """The fit whose score of a modality stands in a row, if the field has that modality; None where the scene has no such fit.
 
-    There is none for a modality that is not fitted or that the scene lacks, for one beside itself, for a number of frames that the scene
-    does not have to spare, and for frames without mosaic and lens to be demosaicked.
+    There is none with a modality that the scene lacks, with one beside itself, with a number of frames that the scene does not have to
+    spare, and of frames without mosaic and lens to be demosaicked.
 
     Args:
         row: with a modality in place of ``each``.
@@ -156,7 +156,7 @@ def fit_of(row: Row, scored: str, scene: Scene) -> Fit | None:
     meant = lambda word: scored if word == "scored" else canonical_modality(word)
     named = [meant(word) for word in row.modalities if word != "all"]
     wanted = {*named, *(known if "all" in row.modalities else ())}
-    if scored not in wanted or not wanted <= set(known) or len(set(named)) < len(named):
+    if scored not in known or not wanted <= set(known) or len(set(named)) < len(named):
         return None
     if row.input == "demosaicked" and is_plain(scene):
         return None

@@ -20,7 +20,7 @@ from mmsynth.bench.output import Report, write_report
 from mmsynth.bench.tables import Column, Table
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.operations.evaluation.perceptual import lpips_package
+from mmsynth.operations.evaluation.perceptual import find_lpips
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.operations.output.work_partition import WorkPartition, local_device
 from mmsynth.scene.load import load_scene
@@ -104,7 +104,7 @@ def bench_paper(
         ``results`` with ``rows`` (what ``jobs.run_jobs`` gives of every fit, with ``scene`` and ``fit``), ``tables``, ``unfinished``
         and ``failed``: names of fits, and sentences by name; ``notes``: sentences. No files where others are still at work.
     Raises:
-        InputError: both or neither length, no scene or two of one name, a scene or table that cannot be read, tables without a row for
+        InputError: both or neither length, no scene or two of one name, a scene or table that cannot be read, no table with a row for
             these scenes, no seed or one twice, or ``out`` cannot be written.
     """
     if (steps is None) == (budget is None):
@@ -156,25 +156,22 @@ def cells_of(experiments: Mapping[str, Experiment], scenes: Mapping[str, Scene])
     """Every number that the tables can have on these scenes.
 
     Raises:
-        InputError: a table without any.
+        InputError: none.
     """
     modalities = list(dict.fromkeys(name for scene in scenes.values() for name in scene.sensors))
-    cells = []
-    for table, experiment in experiments.items():
-        rows = [row for given in experiment.row for row in given.repeated(modalities)]
-        found = [
-            Cell(table, row, modality, name, fit)
-            for row in rows
-            for modality in modalities
-            for name, scene in scenes.items()
-            if (fit := fit_of(row, modality, scene)) is not None
-        ]
-        if not found:
-            raise InputError(
-                f"table {table!r}: none of its rows can be fitted to these scenes ({', '.join(scenes)}), whose modalities are "
-                f"{', '.join(modalities)}."
-            )
-        cells += found
+    cells = [
+        Cell(table, row, modality, name, fit)
+        for table, experiment in experiments.items()
+        for given in experiment.row
+        for row in given.repeated(modalities)
+        for modality in modalities
+        for name, scene in scenes.items()
+        if (fit := fit_of(row, modality, scene)) is not None
+    ]
+    if not cells:
+        raise InputError(
+            f"tables {', '.join(experiments)}: none of their rows can be fitted to {', '.join(scenes)}, with {', '.join(modalities)}."
+        )
     return cells
 
 
@@ -198,10 +195,13 @@ Rows = Mapping[tuple[str, Fit, int], Mapping[str, Any]]
 
 
 def score_of(result: Mapping[str, Any], modality: str, score: str) -> float | None:
-    """One number of a result; no foreground by the field's own opacity, which differs from fit to fit."""
+    """One number of a result, None where the field has no such modality; no foreground by its own opacity, which differs from fit to
+    fit."""
+    scores = result["scores"]["modalities"].get(modality)
+    if scores is None:
+        return None
     if score in ("seconds", "steps"):
         return float(result[score])
-    scores = result["scores"]["modalities"].get(modality, {})
     if score.startswith("psnr_foreground") and scores.get("foreground_from") == "opacity":
         return None
     return scores.get(score)
@@ -256,11 +256,14 @@ def _report(plan: Plan, found: Rows, results: dict[str, Any], out: Path, only_if
     shown = []
     for table, experiment in plan.experiments.items():
         cells = [cell for cell in plan.cells if cell.table == table]
+        if not cells:
+            results["notes"].append(f"table {table!r} is left out: no scene has the modalities, frames, mosaics or lenses for it.")
+            continue
         lines = lines_of(cells, plan.modalities, found, results["seeds"])
         note = _note(experiment, cells, plan, found, results)
         results["tables"].append({"name": table, "title": experiment.title, "source": experiment.source, "note": note, "lines": lines})
         shown.append(_table(experiment, lines, plan.modalities, note))
-    results["notes"] = _notes(plan, results)
+    results["notes"] += _notes(plan, results)
     if results["unfinished"] and only_if_finished:
         return Report(results, [], out)
     first = shown[0]
@@ -302,6 +305,6 @@ def _notes(plan: Plan, results: Mapping[str, Any]) -> list[str]:
     waiting = len(results["unfinished"]) - len(results["failed"])
     if waiting > 0:
         told.append(f"{waiting} of {len(plan.jobs)} fits are not finished; run the command again when they are.")
-    if lpips_package() is None:
-        told.append("no LPIPS: lpips or torchmetrics, torchvision and AlexNet's weights are not all installed, and nothing is downloaded.")
+    if find_lpips() is None:
+        told.append("no LPIPS: lpips or torchmetrics, with torchvision and AlexNet's weights, is not installed, and nothing is downloaded.")
     return told

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import HEIGHT, WIDTH
 from rows import measured
 
 from mmsynth.bench import jobs, machine, paper
@@ -21,6 +22,7 @@ from mmsynth.errors import DivergedError, InputError
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.operations.output.work_partition import WorkPartition
 from mmsynth.packaged import data_folder
+from mmsynth.scene.image_writers import write_png
 
 EXAMPLE = data_folder("example_scene")
 FIVE = ("rgb", "nir", "mono", "pol", "ms")
@@ -140,6 +142,42 @@ def test_processes_share_the_fits_and_the_last_makes_the_tables(fits: list[Job],
     assert bench_paper([EXAMPLE], tmp_path / "out", Recipe(), ["pairs"], steps=3, part=WorkPartition(0, 4)).files
 
 
+def test_what_scenes_have_nothing_for_is_left_out_and_said(fits: list[Job], write_mmsdata: Callable[..., Path], tmp_path: Path) -> None:
+    def rgb_alone(meta: dict[str, Any]) -> None:
+        del meta["modalities"]["infrared"]
+
+    report = bench_paper([write_mmsdata(edit=rgb_alone)], tmp_path / "out", Recipe(), ["few-frames", "together", "rgb-only"], steps=3)
+    assert [table["name"] for table in report.results["tables"]] == ["together", "rgb-only"]
+    assert any("'few-frames' is left out" in note for note in report.results["notes"]) and len(fits) == 1
+    assert lines(report, "together")["alone"]["modalities"] == lines(report, "together")["together"]["modalities"]
+
+
+def test_a_modality_that_the_field_does_not_know_has_no_score(fits: list[Job], tmp_path: Path) -> None:
+    report = bench_paper([EXAMPLE], tmp_path / "out", Recipe(), ["rgb-only"], steps=3)
+    for score in ("psnr", "ssim", "seconds", "steps"):
+        found = lines(report, "rgb-only", score)
+        assert set(found["rgb only"]["modalities"]) == {"rgb"} and set(found["together"]["modalities"]) == set(FIVE)
+
+
+def test_masks_are_learned_and_scored_with_and_part_of_a_result(
+    fits: list[Job], write_mmsdata: Callable[..., Path], tmp_path: Path
+) -> None:
+    root, masks = write_mmsdata(), tmp_path / "masks"
+    for name in ("rgb", "infrared"):
+        for view in range(4):
+            write_png(masks / name / f"{view:04d}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    run = lambda: bench_paper([root], tmp_path / "out", Recipe(), ["rgb-only"], steps=3, masks="ignore", mask_folder=masks)
+    run()
+    run()
+    assert len(fits) == 2
+    for task in (job.task() for job in fits):
+        for scene in (jobs.scene_of(task), jobs.whole_scene_of(task)):
+            assert scene.masks == "ignore" and all(frame.mask and frame.mask.parent.parent == masks for frame in scene.frames)
+    write_png(masks / "rgb" / "0000.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    run()
+    assert len(fits) == 4
+
+
 def test_foreground_by_the_fields_own_opacity_is_no_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fake(job: Job) -> dict[str, Any]:
         result = measured(**dict.fromkeys(job.modalities or FIVE, 30.0))
@@ -189,7 +227,7 @@ def test_bad_requests_run_nothing(fits: list[Job], tmp_path: Path, write_mmsdata
     def without_rgb(meta: dict[str, Any]) -> None:
         del meta["modalities"]["rgb"]
 
-    with pytest.raises(InputError, match=r"'few-frames'.*nir"):
+    with pytest.raises(InputError, match=r"few-frames.*scene, with nir"):
         bench_paper([write_mmsdata(edit=without_rgb)], tmp_path / "out", Recipe(), ["few-frames"], steps=3)
     assert not fits and not (tmp_path / "out").exists()
 

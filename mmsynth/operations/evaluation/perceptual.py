@@ -18,28 +18,27 @@ LARGE_ENOUGH = 64
 """Pixels a side below which a picture has no LPIPS: AlexNet's strides leave nothing of it."""
 
 
-def lpips_package() -> str | None:
-    """``lpips`` or ``torchmetrics``, the one that can be used here; None: neither, or torchvision or its weights are not there."""
-    if find_spec("torchvision") is None or not any((Path(torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth")):
-        return None
-    return next((name for name in ("lpips", "torchmetrics") if find_spec(name) is not None), None)
-
-
 @functools.lru_cache(maxsize=1)
 def find_lpips() -> Distance | None:
-    """The distance, None where ``lpips_package`` is."""
-    package = lpips_package()
-    if package is None:
+    """The distance; None where neither package, or not torchvision, or not AlexNet's weights are installed."""
+    # torchvision downloads what is not in its cache
+    cached = (Path(torch.hub.get_dir()) / "checkpoints").glob("alexnet-*.pth")
+    package = next((name for name in ("lpips", "torchmetrics") if find_spec(name) is not None), None)
+    if package is None or find_spec("torchvision") is None or not any(cached):
         return None
     score: Any
-    if package == "lpips":
-        import lpips
+    try:
+        if package == "lpips":
+            import lpips
 
-        score = lpips.LPIPS(net="alex", verbose=False).eval()
-    else:
-        from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
+            score = lpips.LPIPS(net="alex", verbose=False).eval()
+        else:
+            from torchmetrics.functional.image import learned_perceptual_image_patch_similarity
 
-        score = functools.partial(learned_perceptual_image_patch_similarity, net_type="alex")
+            score = functools.partial(learned_perceptual_image_patch_similarity, net_type="alex")
+        score(*torch.zeros(2, 1, 3, LARGE_ENOUGH, LARGE_ENOUGH), normalize=True)
+    except Exception:  # a torchvision that was built for another torch says RuntimeError, or AttributeError, or OSError
+        return None
 
     def distance(a: Tensor, b: Tensor) -> float:
         with torch.no_grad():
