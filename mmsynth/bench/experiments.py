@@ -33,7 +33,8 @@ from mmsynth.packaged import data_folder
 from mmsynth.scene.scene import Scene, canonical_modality
 from mmsynth.toml import read_toml
 
-_WORDS = ("all", "scored", "each")
+PACKAGED = ("together", "pairs", "half", "unbalanced", "mosaics", "rgb-only", "few-frames")
+"""Tables of ``recipes/paper``, in the order in which they are made."""
 Count = Annotated[int, Field(strict=True, ge=1)]
 Share = Annotated[float, Field(strict=True, gt=0, le=1)]
 
@@ -136,7 +137,7 @@ def load_experiments(names: Sequence[str] | None = None) -> dict[str, Experiment
         InputError: no such table, broken TOML, an unknown key, a value out of range, a name twice.
     """
     folder = data_folder("recipes") / "paper"
-    chosen = sorted(path.stem for path in folder.glob("*.toml")) if names is None else list(names)
+    chosen = list(PACKAGED if names is None else names)
     found = {Path(name).stem: read_toml(recipe_path(name, folder, "table"), Experiment) for name in chosen}
     if not found or len(found) < len(chosen):
         raise InputError(f"--tables {','.join(chosen)}: expected one or more tables, each once.")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mmsynth.bench.experiments import Fit, Row, fit_of, load_experiments
+from mmsynth.bench.experiments import PACKAGED, Fit, Row, fit_of, load_experiments
 from mmsynth.errors import InputError
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.packaged import data_folder
@@ -37,7 +37,7 @@ def everything(frames: int | None = None, rays: float = 1.0) -> Fit:
 
 
 def test_the_papers_tables_are_there() -> None:
-    assert set(load_experiments()) == {"together", "pairs", "half", "unbalanced", "mosaics", "rgb-only", "few-frames"}
+    assert tuple(load_experiments()) == PACKAGED and set(PACKAGED) == {p.stem for p in (data_folder("recipes") / "paper").iterdir()}
     assert list(load_experiments(["pairs", "half"])) == ["pairs", "half"]
 
 
