@@ -22,7 +22,7 @@ from mmsynth.errors import DivergedError, InputError
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.operations.evaluation.perceptual import find_lpips
 from mmsynth.operations.output.progress import Counter, Progress
-from mmsynth.operations.output.work_partition import WorkPartition, local_device
+from mmsynth.operations.output.work_partition import WorkPartition
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import MaskMeaning, Scene
 
@@ -118,7 +118,7 @@ def bench_paper(
         chosen = None if len(fit.modalities) == known else fit.modalities
         return Job(
             f"{path.resolve().name}-{fit.name}-seed{seed}", str(path), fit.recipe(recipe, known if budget is None else None), chosen,
-            dict(fit.frames), seed, steps, budget, local_device(device), masks=masks,
+            dict(fit.frames), seed, steps, budget, device, masks=masks,
             mask_folder=None if mask_folder is None else str(mask_folder), input=fit.input, prepared=str(out / "prepared"),
             any_machine=True,
         )  # fmt: skip
@@ -156,7 +156,7 @@ def cells_of(experiments: Mapping[str, Experiment], scenes: Mapping[str, Scene])
     """Every number that the tables can have on these scenes.
 
     Raises:
-        InputError: none.
+        InputError: there is none.
     """
     modalities = list(dict.fromkeys(name for scene in scenes.values() for name in scene.sensors))
     cells = [

@@ -25,6 +25,7 @@ from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.operations.evaluation.evaluate import evaluate
+from mmsynth.operations.output.work_partition import local_device
 
 
 def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -38,7 +39,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     Raises:
         InputError: as ``fit`` and ``evaluate``.
     """
-    device = task["device"]
+    device = local_device(task["device"])
     if device == "cpu":
         warm_up()
     if task["input"] != "raw":
@@ -55,7 +56,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "seconds": seconds,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),
         "peak_memory_bytes": peak,
-        **({"peak_gpu_bytes": torch.cuda.max_memory_allocated()} if device == "cuda" else {}),
+        **({} if device == "cpu" else {"peak_gpu_bytes": torch.cuda.max_memory_allocated(device)}),
         **{key: field.manifest[key] for key in ("steps", "rays_per_s", "samples_per_s")},
         "render_rays_per_s": scores["rays_per_s"],
         "scores": scores,
