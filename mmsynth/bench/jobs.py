@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,13 +24,19 @@ from mmsynth.bench.machine import identify
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.files import read_json, write_json
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.operations.export.demosaicked import write_demosaicked
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.load import load_scene
-from mmsynth.scene.scene import Scene, keep_frames
+from mmsynth.scene.scene import MaskMeaning, Scene, keep_frames
+
+Input = Literal["raw", "demosaicked"]
+"""What is learned from: frames as they were recorded, or demosaicked and undistorted ones (``write_demosaicked``)."""
 
 _PACKAGE = Path(__file__).parents[1]
 # what a fit and its score run through
-_CODE = ("field", "fitting", "scene", "sensors", "operations/evaluation", "bench/worker.py")
+_CODE = ("field", "fitting", "scene", "sensors", "operations/evaluation", "operations/export/demosaicked.py", "bench/worker.py")
+# of a task, where files are: the identity has what is in them
+_PLACES = ("scene", "mask_folder", "prepared")
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,8 @@ class Job:
         name: unique in its bench; names the file of the result. scene: folder or JSON file.
         modalities: names to fit; None: all. frames: modality → training frames to keep (``keep_frames``).
         steps, budget: length in optimiser steps, or in seconds; one of the two. device: cpu or cuda.
+        masks, mask_folder: as for ``load_scene``. input: what is learned from; scored on the frames as they were recorded in any case.
+        prepared: folder for copies of scenes that another ``input`` takes. any_machine: a result counts on whatever machine it was made.
     """
 
     name: str
@@ -52,6 +60,11 @@ class Job:
     steps: int | None
     budget: float | None
     device: str = "cpu"
+    masks: MaskMeaning | None = None
+    mask_folder: str | None = None
+    input: Input = "raw"
+    prepared: str = "prepared"
+    any_machine: bool = False
 
     def task(self) -> dict[str, Any]:
         """What the child process has to do, ready for JSON."""
@@ -59,12 +72,22 @@ class Job:
 
 
 def scene_of(task: Mapping[str, Any]) -> Scene:
-    """The scene of a ``Job.task``, with its modalities and frames alone.
+    """The scene that a ``Job.task`` learns from, with its modalities and frames alone.
 
     Raises:
-        InputError: no such scene, modality or number of frames.
+        InputError: no such scene, modality or number of frames, or a copy of it that cannot be made.
     """
-    return keep_frames(load_scene(Path(task["scene"]), modalities=task["modalities"]), task["frames"])
+    scene = whole_scene_of(task, task["modalities"])
+    if task["input"] == "demosaicked":
+        copy = Path(task["prepared"]) / f"{scene.root.resolve().name}-{scene_hash(scene)[:12]}"
+        scene = load_scene(write_demosaicked(scene, copy), modalities=task["modalities"], masks=scene.masks)
+    return keep_frames(scene, task["frames"])
+
+
+def whole_scene_of(task: Mapping[str, Any], modalities: Sequence[str] | None = None) -> Scene:
+    """The scene as it was recorded, with all frames: what a task is scored on."""
+    folder = task["mask_folder"]
+    return load_scene(Path(task["scene"]), modalities=modalities, masks=task["masks"], mask_folder=None if folder is None else Path(folder))
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -> Iterator[dict[str, Any]]:
@@ -80,19 +103,41 @@ def run_jobs(jobs: Sequence[Job], out: Path, progress: Progress | None = None) -
     """
     for job in jobs:
         scene_of(job.task())
-    hashes = {path: scene_hash(load_scene(path)) for path in {job.scene for job in jobs}}
+    hashes = scene_hashes(jobs)
     counter = Counter(progress, len(jobs))
     counter(0)
     for job in jobs:
         # looked up when its turn comes: the code may have been edited since the bench began
-        wanted = identity(job, hashes[job.scene])
-        path = out / "rows" / f"{job.name}-{hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:12]}.json"
-        if not path.is_file():
-            about = {"name": job.name, "seed": job.seed, "device": job.device} | {k: wanted["machine"][k] for k in ("cores", "threads")}
-            result = run_job(job)
-            write_json(path, {**about, **result, "mean": mean_over_modalities(result["scores"]), "identity": wanted})
-        yield read_json(path)
+        yield result_of(job, hashes[job.scene], out)
         counter(1)
+
+
+def scene_hashes(jobs: Sequence[Job]) -> dict[str, str]:
+    """``scene_hash`` of the whole scene of each job, by its path."""
+    return {path: scene_hash(whole_scene_of(job.task())) for path, job in {job.scene: job for job in jobs}.items()}
+
+
+def result_of(job: Job, scene: str, out: Path) -> dict[str, Any]:
+    """The row of one job, see ``run_jobs``; ``scene``: its ``scene_hash``."""
+    path, wanted = _file_of(job, scene, out)
+    if not path.is_file():
+        machine = identify()
+        about = {"name": job.name, "seed": job.seed, "device": job.device, "cores": machine["cores"], "threads": machine["threads"]}
+        result = run_job(job)
+        write_json(path, {**about, **result, "mean": mean_over_modalities(result["scores"]), "identity": wanted})
+    return dict(read_json(path))
+
+
+def finished_result_of(job: Job, scene: str, out: Path) -> dict[str, Any] | None:
+    """The same where it is there already, else None."""
+    path, _ = _file_of(job, scene, out)
+    return read_json(path) if path.is_file() else None
+
+
+def _file_of(job: Job, scene: str, out: Path) -> tuple[Path, dict[str, Any]]:
+    """Where its row is or will be, and the identity that the name stands for."""
+    wanted = identity(job, scene)
+    return out / "rows" / f"{job.name}-{hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:12]}.json", wanted
 
 
 def run_job(job: Job) -> dict[str, Any]:
@@ -115,6 +160,9 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
         command = [sys.executable, "-m", module, json.dumps(task), folder]
         path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, "PYTHONPATH": path}
+        # torchrun limits torch alone; numba would take all cores for each of the processes
+        if environment.get("OMP_NUM_THREADS", "").isdecimal():
+            environment.setdefault("NUMBA_NUM_THREADS", environment["OMP_NUM_THREADS"])
         # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
             status = process.wait()
@@ -131,13 +179,14 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
 def identity(job: Job, scene: str) -> dict[str, Any]:
     """Everything that a result depends on; ``scene``: the ``scene_hash`` of the whole scene."""
     machine = identify()
-    task = {key: value for key, value in job.task().items() if key != "scene"}
+    task = {key: value for key, value in job.task().items() if key not in _PLACES}
+    keys = () if job.any_machine else ("cpu", "cores", "threads", *(["gpu"] if job.device == "cuda" else []))
     return {
         "scene": scene,
         **task,
         "code": code_hash(),
         "versions": machine["versions"],
-        "machine": {key: machine[key] for key in ("cpu", "cores", "threads", *(["gpu"] if job.device == "cuda" else []))},
+        "machine": {key: machine[key] for key in keys},
     }
 
 

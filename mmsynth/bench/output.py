@@ -23,24 +23,28 @@ class Report:
 
     Attributes:
         results: ready for JSON: ``bench, machine, rows`` and what the bench adds. tables: the same to read. out: the folder it lies in.
+        files: names of what was written there.
     """
 
     results: dict[str, Any]
     tables: Sequence[Table]
     out: Path
+    files: tuple[str, ...] = ()
 
 
-def write_report(results: dict[str, Any], tables: Sequence[Table], figure: Figure, out: Path) -> Report:
-    """Write the three files.
+def write_report(results: dict[str, Any], tables: Sequence[Table], figure: Figure | None, out: Path) -> Report:
+    """Write the three files, or two where there is nothing to plot.
 
     Raises:
         InputError: ``out`` cannot be written.
     """
     title = f"# mmsynth bench {results['bench']}\n\n{describe(results['machine'])}\n"
-    write_text(out / "report.md", "\n".join([title, *map(markdown, tables), "![plot](plot.svg)", ""]))
-    write_atomic(out / "plot.svg", lambda path: FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None}))
+    plot = [] if figure is None else ["![plot](plot.svg)", ""]
+    write_text(out / "report.md", "\n".join([title, *map(markdown, tables), *plot]))
+    if figure is not None:
+        write_atomic(out / "plot.svg", lambda path: FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None}))
     write_json(out / "results.json", results)
-    return Report(results, tables, out)
+    return Report(results, tables, out, ("results.json", "report.md", *(["plot.svg"] if plot else [])))
 
 
 def new_figure(panels: int, height: float = 4.2) -> tuple[Figure, list[Axes]]:

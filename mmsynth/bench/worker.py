@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from mmsynth.bench.jobs import scene_of
+from mmsynth.bench.jobs import scene_of, whole_scene_of
 from mmsynth.bench.machine import peak_memory
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.warmup import warm_up
@@ -25,7 +25,7 @@ from mmsynth.files import write_json
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.operations.evaluation.evaluate import evaluate
-from mmsynth.scene.load import load_scene
+from mmsynth.operations.output.work_partition import local_device
 
 
 def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -39,22 +39,24 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     Raises:
         InputError: as ``fit`` and ``evaluate``.
     """
-    device = task["device"]
+    device = local_device(task["device"])
     if device == "cpu":
         warm_up()
+    if task["input"] != "raw":
+        scene_of(task)  # the copy that it takes is made before the clock starts
     began, cpu = time.perf_counter(), time.process_time()
     scene = scene_of(task)
     length = {"steps": task["steps"], "budget": task["budget"]}
     field = fit(scene, folder / "run", recipe=Recipe(**task["recipe"]), **length, seed=task["seed"], device=device)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
-    # the whole scene, so that sensors that were not fitted still lend their poses to be scored at
-    scores = evaluate(field, load_scene(task["scene"]), views=scene.split.test)
+    # the whole scene, so that sensors that were not fitted still lend their poses to be scored at, and as it was recorded
+    scores = evaluate(field, whole_scene_of(task), views=scene.split.test)
     return {
         "seconds": seconds,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),
         "peak_memory_bytes": peak,
-        **({"peak_gpu_bytes": torch.cuda.max_memory_allocated()} if device == "cuda" else {}),
+        **({} if device == "cpu" else {"peak_gpu_bytes": torch.cuda.max_memory_allocated(device)}),
         **{key: field.manifest[key] for key in ("steps", "rays_per_s", "samples_per_s")},
         "render_rays_per_s": scores["rays_per_s"],
         "scores": scores,

@@ -12,6 +12,7 @@ from mmsynth.cli.arguments import (
     DeviceOption,
     FramesOption,
     JsonOption,
+    MasksOption,
     ModalitiesOption,
     RecipeOption,
     RunOption,
@@ -19,12 +20,14 @@ from mmsynth.cli.arguments import (
     fit_length,
     frame_limits,
     lengths,
+    masks_of,
     modality_names,
     scene_path,
     seconds_of,
     whole_numbers,
 )
 from mmsynth.cli.terminal import app, command, progress_bar
+from mmsynth.errors import InputError
 
 bench_app = typer.Typer(no_args_is_help=True, help="Measure speed against error: a table, a plot and JSON, in bench/NAME or --out.")
 app.add_typer(bench_app, name="bench")
@@ -99,6 +102,48 @@ def bench_ablation(
     with progress_bar("bench ablation", as_json) as show:
         report = measure(scene_path(scene), table, out, steps, seconds, whole_numbers(seeds, "--seeds"), chosen, show, pick_device(device))
     print_report(report, as_json)
+
+
+@command("paper", of=bench_app)
+def bench_paper(
+    scenes: Annotated[list[str], typer.Argument(metavar="SCENE...", help="scene folders, or `example` for the packaged scene")],
+    tables: Annotated[str | None, typer.Option(help="names of tables, or TOML files; default: all of recipes/paper")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="length of every fit in optimiser steps")] = None,
+    budget: Annotated[str | None, typer.Option(help="or its time; default 60s")] = None,
+    seeds: Annotated[str, typer.Option(help="everything is fitted with each, e.g. 0,1,2")] = "0",
+    recipe: RecipeOption = None,
+    masks: MasksOption = None,
+    device: DeviceOption = "cpu",
+    out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/paper"),
+    as_json: JsonOption = False,
+) -> None:
+    """The tables of MultimodalStudio and SPOiLeR, on any scenes. Under torchrun every process takes its share of the fits."""
+    from mmsynth.bench.paper import bench_paper as measure
+    from mmsynth.fitting.device import pick_device
+    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.operations.output.work_partition import partition_of_environment
+
+    chosen = None if tables is None else [name.strip() for name in tables.split(",")]
+    meaning, folder = masks_of(masks)
+    with progress_bar("bench paper", as_json) as show:
+        report = measure(
+            [scene_path(scene) for scene in scenes],
+            out,
+            load_recipe(recipe),
+            chosen,
+            steps,
+            fit_length(steps, budget, "60s"),
+            whole_numbers(seeds, "--seeds"),
+            meaning,
+            folder,
+            pick_device(device),
+            partition_of_environment(),
+            show,
+        )
+    print_report(report, as_json)
+    failed = report.results["failed"]
+    if failed:
+        raise InputError(f"paper: {len(failed)} fits failed, first: {next(iter(failed.values()))}")
 
 
 @command("numerics", of=bench_app)
@@ -180,4 +225,7 @@ def print_report(report: Any, as_json: bool) -> None:
         print(json.dumps(report.results | {"out": str(report.out)}))
         return
     print_tables(report.tables)
-    print(f"wrote {report.out}/ (results.json, report.md, plot.svg)")
+    for note in report.results.get("notes", ()):
+        print(f"note: {note}")
+    if report.files:
+        print(f"wrote {report.out}/ ({', '.join(report.files)})")

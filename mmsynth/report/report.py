@@ -28,10 +28,12 @@ if TYPE_CHECKING:
 # what each score means to a reader: label, decimals
 _COLUMNS = {
     "psnr": ("PSNR [dB]", 2),
+    "psnr_view_mean": ("PSNR, mean of dB over views", 2),
     "psnr_foreground": ("PSNR foreground, pooled [dB]", 2),
     "psnr_foreground_view_mean": ("PSNR foreground, mean of dB over views", 2),
     "foreground_from": ("foreground from", 0),
     "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
     "psnr_truth": ("PSNR against truth [dB]", 2),
     "psnr_aligned": ("PSNR aligned [dB]", 2),
     "psnr_aligned_free_gain": ("aligned, free gain [dB]", 2),

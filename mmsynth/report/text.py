@@ -16,6 +16,7 @@ _COLUMNS = {
     "psnr_foreground": "foreground",
     "psnr_foreground_view_mean": "view mean",
     "ssim": "ssim",
+    "lpips": "lpips",
     "psnr_truth": "truth [dB]",
     "psnr_aligned": "aligned [dB]",
     "psnr_aligned_free_gain": "free gain",

@@ -59,6 +59,29 @@ def test_bench_ablation(tmp_path: Path) -> None:
     assert (tmp_path / "here" / "report.md").is_file()
 
 
+def test_bench_paper(tmp_path: Path) -> None:
+    head = 'title = "Two"\nsource = "nobody"\n'
+    rows = '[[row]]\nname = "both"\nmodalities = ["rgb", "pol"]\n[[row]]\nname = "one"\nmodalities = ["rgb"]\n'
+    (tmp_path / "two.toml").write_text(head + rows)
+    command = ("bench", "paper", "example", "--tables", "two.toml", "--steps", "3", "--out", "here")
+    result = call(*command, "--json")
+    assert result.exit_code == 0, result.output
+    results = json.loads(result.stdout)
+    assert results["out"] == "here" and {row["fit"] for row in results["rows"]} == {"rgb+pol", "rgb"}
+    (table,) = results["tables"]
+    psnr = {line["row"]: line["modalities"] for line in table["lines"] if line["score"] == "psnr"}
+    scores = {row["fit"]: row["scores"]["modalities"] for row in results["rows"]}
+    assert psnr == {
+        "both": {name: scores["rgb+pol"][name]["psnr"] for name in ("rgb", "pol")},
+        "one": {"rgb": scores["rgb"]["rgb"]["psnr"]},
+    }
+    assert {"psnr_view_mean", "psnr_foreground", "ssim", "seconds"} <= {line["score"] for line in table["lines"]}
+    made = {file: file.stat().st_mtime_ns for file in (tmp_path / "here" / "rows").iterdir()}
+    again = call(*command)
+    assert again.exit_code == 0 and "wrote here/ (results.json, report.md)" in again.stdout and "PSNR, pooled" in again.stdout
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "here" / "rows").iterdir()} == made
+
+
 def test_bench_kernels(tmp_path: Path) -> None:
     result = call("bench", "kernels", "--samples", "256", "--threads", "1", "--json")
     assert result.exit_code == 0, result.output
@@ -77,6 +100,9 @@ def test_bad_requests_are_refused_in_one_sentence(tmp_path: Path) -> None:
     refused(call("bench", "ablation", "example", "--seeds", "one"), "--seeds")
     refused(call("bench", "ablation", "example", "--steps", "3", "--budget", "3s"), "--steps", "--budget")
     refused(call("bench", "ablation", "example", "--only", "nothing"), "nothing", "baseline")
+    refused(call("bench", "paper", "nowhere"), "nowhere")
+    refused(call("bench", "paper", "example", "--tables", "half,nothing"), "nothing", "few-frames")
+    refused(call("bench", "paper", "example", "--masks", "nowhere"), "--masks", "nowhere")
     refused(call("bench", "kernels", "--threads", "99999"), "--threads")
     refused(call("bench", "fit", "example", "--device", "tpu"), "--device", "cpu or cuda")
     refused(call("bench", "ablation", "example", "--device", "tpu"), "--device", "cpu or cuda")

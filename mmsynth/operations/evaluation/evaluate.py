@@ -5,12 +5,14 @@ averaged per view in dB):
 
 * ``psnr``: raw photosites with a valid lens ray. A sensor clips, so predictions are clipped to [0, 1] here. What is transparent, or
   outside the masks of an object, counts as black; what is outside masks that say what to ignore does not count, here and in ``ssim``.
-* ``psnr_foreground``: the same in the foreground. ``foreground_from``: "masks" (the scene's masks or alpha), "gt" (first hit in the
+* ``psnr_view_mean``: the mean of dB over views, each view's MSE pooled over its pixels.
+* ``psnr_foreground``: as ``psnr``, in the foreground. ``foreground_from``: "masks" (the scene's masks or alpha), "gt" (first hit in the
   region), and only where there is neither "opacity" (the field's own > 0.5: a field must not choose its own exam, so it says so).
 * ``psnr_foreground_view_mean``: the mean of dB over views, each view's MSE pooled over the pixels of its foreground. Papers on MMS-DATA
   give this one; where views differ it is mostly the higher of the two, as a geometric mean of errors is below the arithmetic one.
 * ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
   mosaic per channel.
+* ``lpips``: of Zhang et al. 2018, where a network is installed, see ``perceptual``.
 * ``psnr_truth``, ``psnr_truth_full``: all channels at every pixel of the own pose against ``gt/<modality>``, in the region and
   everywhere; both clipped to [0, 1], the range that frames can record.
 * ``psnr_aligned``: the same at the RGB camera's pose (``gt/aligned``), in the region: what sensor-to-sensor synthesis delivers.
@@ -42,6 +44,7 @@ from scipy.spatial import cKDTree
 
 from mmsynth.errors import InputError
 from mmsynth.operations.evaluation.parts import PARTS, parts_of
+from mmsynth.operations.evaluation.perceptual import LARGE_ENOUGH, Distance, find_lpips, lpips_of_channels
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
@@ -49,7 +52,7 @@ from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, MaskMeaning, Scene, Sensor
 from mmsynth.sensors.camera import depth_along_rays, surface_points
 from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim, ssim_of_channels
-from mmsynth.sensors.mosaic import photosites_of
+from mmsynth.sensors.mosaic import channels_of, photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
 if TYPE_CHECKING:
@@ -62,13 +65,16 @@ _FOREGROUND_SOURCES = ("masks", "gt", "opacity")
 def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Score a field on test views (definitions: module docstring).
 
+    The scene may record other photosites of the same channels through other lenses than the one that the field learned from.
+
     Args:
         views: view ids; None: the scene's test views. progress: called with (rays done, rays in all).
     Returns:
         ``{"modalities": {name: {"psnr", "psnr_foreground", "foreground_from", "ssim", "psnr_truth", ...}}, "geometry": {...},
         "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON.
     Raises:
-        InputError: no frame of these views, a file that cannot be read, or masks that are all empty.
+        InputError: no frame of these views, a sensor with other channels than the field's, a file that cannot be read, or masks that are
+            all empty.
     """
     began = time.perf_counter()
     chosen = tuple(scene.split.test) if views is None else tuple(views)
@@ -107,8 +113,14 @@ class _Exam:
 
     def __init__(self, field: Field, scene: Scene, truth: GroundTruth, count: Counter) -> None:
         self.field, self.truth, self.count, self.metric, self.masks = field, truth, count, scene.unit == "m", scene.masks
-        # what a prior predicts has no frames, and is scored where there is truth
+        # what a prior predicts has no frames, or few, and is scored where there is truth
         names = [name for name in field.sensors if name in scene.sensors or name in field.predicted]
+        self.sensors = {name: scene.sensors.get(name, field.sensors[name]) for name in names}
+        for name, sensor in self.sensors.items():
+            ours = field.sensors[name].channel_count
+            if sensor.channel_count != ours:
+                raise InputError(f"{scene.root}: '{name}' has {sensor.channel_count} channels, expected the {ours} that the field learned.")
+        self.lpips = find_lpips()
         self.scores = {name: _Scores() for name in names}
         self.own_pose = {name: _Scores() for name in names}
         self.geometry = _Scores()
@@ -135,11 +147,11 @@ class _Exam:
 
 def _at_own_pose(exam: _Exam, frame: Frame) -> None:
     """A frame's sensor against the frame, and against noise-free light at its pose."""
-    sensor, scores = exam.field.sensors[frame.sensor], exam.scores[frame.sensor]
+    sensor, scores = exam.sensors[frame.sensor], exam.scores[frame.sensor]
     rendering = exam.render(frame, [sensor.name], False)
     size = rendering.valid.shape
     region = _checked(exam.truth.region(frame), size, f"gt/masks, {sensor.name} view {frame.view}")
-    _score_raw(scores, sensor, frame, rendering, region, exam.masks)
+    _score_raw(scores, sensor, frame, rendering, region, exam.masks, exam.lpips)
     light = _checked(exam.truth.image(frame), (*size, _components(sensor)), f"gt, {sensor.name} view {frame.view}")
     if light is None:
         return
@@ -236,7 +248,15 @@ def _checked(truth: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.
     return truth
 
 
-def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Rendering, region: np.ndarray | None, masks: MaskMeaning) -> None:
+def _score_raw(
+    scores: _Scores,
+    sensor: Sensor,
+    frame: Frame,
+    rendering: Rendering,
+    region: np.ndarray | None,
+    masks: MaskMeaning,
+    lpips: Distance | None,
+) -> None:
     """Against the frame as the sensor recorded it."""
     measured, alpha = load_frame(sensor, frame)
     channels = np.clip(np.nan_to_num(rendering.channels[sensor.name]), 0.0, 1.0)
@@ -254,12 +274,24 @@ def _score_raw(scores: _Scores, sensor: Sensor, frame: Frame, rendering: Renderi
         mask = alpha > 0.5
     foreground = {"masks": mask, "gt": region, "opacity": rendering.opacity > 0.5}
     scores.add("psnr", squared[valid])
+    if valid.any():
+        scores.add("view_mean", _decibels(squared[valid]))
     for source, inside in foreground.items():
         if inside is not None:
             scores.add(f"psnr_foreground/{source}", squared[valid & inside])
             if (valid & inside).any():
-                scores.add(f"view_mean/{source}", np.array(psnr_from_mse(float(squared[valid & inside].mean(dtype=np.float64)))))
-    scores.add("ssim", np.array(raw_ssim(np.clip(measured, 0.0, 1.0), predicted, valid, sensor)))
+                scores.add(f"view_mean/{source}", _decibels(squared[valid & inside]))
+    measured = np.clip(measured, 0.0, 1.0)
+    scores.add("ssim", np.array(raw_ssim(measured, predicted, valid, sensor)))
+    if lpips is not None and min(valid.shape) >= LARGE_ENOUGH:
+        # both demosaicked alike: networks have no eyes for a mosaic
+        seen, shown = (channels_of(values.astype(np.float32), sensor.mosaic) for values in (measured, predicted))
+        scores.add("lpips", np.array(lpips_of_channels(lpips, seen, np.where(valid[..., None], shown, seen))))
+
+
+def _decibels(squared: np.ndarray) -> np.ndarray:
+    """PSNR of squared errors, as an array of one number."""
+    return np.array(psnr_from_mse(float(squared.mean(dtype=np.float64))))
 
 
 def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
@@ -347,12 +379,14 @@ def _prediction(scores: _Scores) -> dict[str, Any]:
 def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
     """The keys of one modality in the order of the module docstring."""
     out = _values(scores, ("psnr",))
+    if "view_mean" in scores.means:
+        out["psnr_view_mean"] = scores.value("view_mean")
     for source in _FOREGROUND_SOURCES:
         value = scores.value(f"psnr_foreground/{source}")
         if value is not None:
             out |= {"psnr_foreground": value, "psnr_foreground_view_mean": scores.value(f"view_mean/{source}"), "foreground_from": source}
             break
-    out |= _values(scores, ("ssim", "psnr_truth", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS)))
+    out |= _values(scores, ("ssim", "lpips", "psnr_truth", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS)))
     out |= _prediction(scores)
     light = ("sam", "stokes_rmse", "s1_s2_rmse", "s1_s2_unpolarized_rmse", "dolp_rmse", "dolp_mae", "aolp_mae")
     return out | (_values(scores, light) or _values(own_pose, light))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from analytic import MS, RGB, AnalyticField, scene_of, sphere
 
 from mmsynth.errors import InputError
@@ -136,6 +137,50 @@ def test_foreground_is_scored_pooled_and_as_the_mean_of_db_over_views(tmp_path: 
     assert found["psnr_foreground_view_mean"] == pytest.approx((20 + 60) / 2, abs=0.1)
     text = score_text({"modalities": {"rgb": found}})
     assert "foreground" in text and "view mean" in text and f"{found['psnr_foreground_view_mean']:.3f}" in text
+
+
+def test_all_pixels_are_scored_pooled_and_as_the_mean_of_db_over_views(tmp_path: Path) -> None:
+    field = AnalyticField(sphere(), [RGB])
+    scene = scene_of(field, tmp_path, truth=False)
+    errors = iter([0.1, 0.01])
+
+    class Off(AnalyticField):
+        def render(self, *args: Any, **kwargs: Any) -> Rendering:
+            out, error = super().render(*args, **kwargs), next(errors)
+            return replace(out, channels={n: c + error for n, c in out.channels.items()})
+
+    found = score(Off(sphere(), [RGB]), scene, views=[2, 3])["modalities"]["rgb"]
+    assert found["psnr"] == pytest.approx(-10 * np.log10((0.1**2 + 0.01**2) / 2), abs=0.02)
+    assert found["psnr_view_mean"] == pytest.approx((20 + 40) / 2, abs=0.1)
+
+
+def test_a_scene_may_record_other_photosites_than_the_field_learned_from(tmp_path: Path) -> None:
+    """A field that learned demosaicked frames is scored on raw ones."""
+    scene = scene_of(AnalyticField(sphere(), [MS]), tmp_path, truth=False)
+    learned = AnalyticField(sphere(), [replace(MS, mosaic=None)])
+    assert score(learned, scene)["modalities"]["ms"]["psnr"] > 90
+    with pytest.raises(InputError, match=f"'ms' has {MS.channel_count} channels, expected the 2"):
+        score(AnalyticField(sphere(), [replace(MS, channels=("a", "b"), wavelengths_nm=(None, None), mosaic=None)]), scene)
+
+
+def test_lpips_is_of_demosaicked_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = AnalyticField(sphere(), [RGB, MS])
+    scene = scene_of(field, tmp_path)
+    assert "lpips" not in score(field, scene)["modalities"]["rgb"]  # frames of 24x18, if it is installed at all
+    shapes = []
+
+    def distance(a: torch.Tensor, b: torch.Tensor) -> float:
+        shapes.append((tuple(a.shape), tuple(b.shape)))
+        return float((a - b).abs().max())
+
+    monkeypatch.setattr("mmsynth.operations.evaluation.evaluate.find_lpips", lambda: distance)
+    assert "lpips" not in score(field, scene)["modalities"]["rgb"] and not shapes
+    monkeypatch.setattr("mmsynth.operations.evaluation.evaluate.LARGE_ENOUGH", 18)
+    found = score(field, scene)["modalities"]
+    assert {shape for pair in shapes for shape in pair} == {(3, 18, 24)} and len(shapes) == 1 + MS.channel_count
+    assert 0 <= found["rgb"]["lpips"] < 1e-4 and 0 <= found["ms"]["lpips"] < 1e-4  # 16-bit rounding
+    brighter = Changed(lambda out: {"channels": {n: c + 0.1 for n, c in out.channels.items()}}, sphere(), [RGB, MS])
+    assert score(brighter, scene)["modalities"]["ms"]["lpips"] == pytest.approx(0.1, abs=1e-3)
 
 
 @pytest.mark.parametrize(("masks", "black", "counts"), [("object", True, True), ("ignore", False, False), ("off", False, True)])
