@@ -2,7 +2,7 @@
 
     python examples/render_prior_scenes.py OUT [--scenes 24] [--seed 0] [--scale 0.67] [--spp 100]
 
-Needs what `render_example_scene.py` needs, whose meshes, camera model, path tracing and files these are; half a minute a scene on one core.
+Needs what `render_example_scene.py` needs, whose meshes, camera model, path tracing and files these are; 20 s a scene on one core.
 Scene i of seed s is always the same, in the folder OUT/s_iiii. A scene that is there is skipped; a killed run continues.
 
 A scene: five to eight things on a table, one to four lamps, a room around them or none. Paints are matte or under a glossy coat, which
@@ -455,7 +455,7 @@ def design(seed: int, index: int) -> Design:
 @functools.cache
 def responses() -> dict[str, np.ndarray]:
     """(C, wavelengths) by modality, at NM, of the packaged sensors; one row for polarization, whose photosites share it."""
-    out = {}
+    out: dict[str, np.ndarray] = {}
     for name in ("rgb", "infrared", "mono", "polarization", "multispectral"):
         curves = [c.response for c in load_sensor(find_sensor_file(f"mmsdata_{name}")).channels]
         known = [curve.at(NM) if curve else out["infrared"][0] for curve in curves]
@@ -499,7 +499,7 @@ def gain_of(sensor: RigSensor, images: np.ndarray) -> float:
 def describe(made: Design, sensors: list[RigSensor], gains: dict[str, float], noise: dict[str, float]) -> dict[str, Any]:
     """sensors.json. ``noise``: median relative standard error of the truth, by modality."""
     white = integrals(made.light())
-    lit = [{"kind": lamp.kind, "share": round(lamp.share, 6), "position_m": lamp.position and example.rounded(lamp.position),
+    lit = [{"kind": lamp.kind, "share": round(lamp.share, 6), "position_m": lamp.position and example.rounded(np.array(lamp.position)),
             "half_edge_m": round(lamp.half_edge, 6), "spectrum": np.round(lamp.spectrum, 6).tolist()} for lamp in made.lamps]  # fmt: skip
     entries = {
         s.name: {
@@ -522,7 +522,7 @@ def build_scene(mi: Any, made: Design) -> tuple[Any, list[tuple[Any, int]]]:
     """Mitsuba scene and (shape, label) pairs."""
     content: dict[str, Any] = {"type": "scene"}
     for i, lamp in enumerate(made.lamps):
-        emitter = {"type": "constant" if lamp.position is None else "area", "radiance": spectrum(lamp.radiance())}
+        emitter: dict[str, Any] = {"type": "constant" if lamp.position is None else "area", "radiance": spectrum(lamp.radiance())}
         emitter["sampling_weight"] = lamp.share
         if lamp.position is None:
             content[f"lamp{i}"] = emitter
