@@ -2,7 +2,7 @@
 
     python examples/render_prior_scenes.py OUT [--scenes 24] [--seed 0] [--scale 0.67] [--spp 100]
 
-Needs what `render_example_scene.py` needs, whose meshes, camera model, path tracing and files these are; 20 s a scene on one core.
+Needs what `render_example_scene.py` needs, whose meshes, camera model, path tracing and files these are; 27 s a scene on one core.
 Scene i of seed s is always the same, in the folder OUT/s_iiii. A scene that is there is skipped; a killed run continues.
 
 A scene: five to eight things on a table, one to four lamps, a room around them or none. Paints are matte or under a glossy coat, which
