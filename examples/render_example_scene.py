@@ -435,7 +435,8 @@ def build_scene(mi: Any) -> tuple[Any, list[tuple[Any, int]], list[tuple[str, Su
     """Mitsuba scene, (shape, label) pairs and the surfaces."""
     things = parts(mi)
     meshes = [to_mitsuba(mi, f"part{i}", surface, bsdf) for i, (_, surface, bsdf) in enumerate(things)]
-    scene = mi.load_dict({"type": "scene", **lamps(mi), **{f"part{i}": mesh for i, mesh in enumerate(meshes)}})
+    # parallel loading may put the lamps in another order: other samples
+    scene = mi.load_dict({"type": "scene", **lamps(mi), **{f"part{i}": mesh for i, mesh in enumerate(meshes)}}, parallel=False)
     shapes = {shape.id(): shape for shape in scene.shapes()}
     labelled = [(shapes[f"part{i}"], LABELS.index(name)) for i, (name, _, _) in enumerate(things)]
     return scene, labelled, [(name, surface) for name, surface, _ in things]

@@ -532,7 +532,7 @@ def build_scene(mi: Any, made: Design) -> tuple[Any, list[tuple[Any, int]]]:
         content[f"lamp{i}"] = {"type": "rectangle", "to_world": place, "emitter": emitter}
     for i, t in enumerate(made.things):
         content[f"part{i}"] = example.to_mitsuba(mi, f"part{i}", t.surface, t.bsdf(mi))
-    scene = mi.load_dict(content)
+    scene = mi.load_dict(content, parallel=False)  # the same order of lamps, so the same samples, every time
     shapes = {shape.id(): shape for shape in scene.shapes()}
     return scene, [(shapes[f"part{i}"], i + 1) for i in range(len(made.things))]
 
