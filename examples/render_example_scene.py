@@ -419,9 +419,9 @@ def lamps(mi: Any) -> dict[str, Any]:
     white = np.ones_like(WAVELENGTHS)
     # position [m], half edge [m], radiance, share of the light on the table (where to send samples)
     boxes = {
-        "key": ((0.75, -0.55, 0.95), 0.26, 7.5, 0.45),
-        "fill": ((-0.95, 0.1, 0.75), 0.3, 2.2, 0.18),
         "rim": ((0.1, 0.95, 0.8), 0.2, 4.5, 0.16),
+        "fill": ((-0.95, 0.1, 0.75), 0.3, 2.2, 0.18),
+        "key": ((0.75, -0.55, 0.95), 0.26, 7.5, 0.45),
     }
     out: dict[str, Any] = {"sky": {"type": "constant", "radiance": spectrum(0.12 * white), "sampling_weight": 0.21}}
     for name, (position, half, power, share) in boxes.items():
@@ -431,12 +431,16 @@ def lamps(mi: Any) -> dict[str, Any]:
     return out
 
 
+def load_scene(mi: Any, content: dict[str, Any]) -> Any:
+    """Mitsuba scene with its lamps in the order given, so samples are the same every time: the optimizer sorts them by addresses."""
+    return mi.load_dict({"type": "scene", **content}, optimize=False)
+
+
 def build_scene(mi: Any) -> tuple[Any, list[tuple[Any, int]], list[tuple[str, Surface]]]:
     """Mitsuba scene, (shape, label) pairs and the surfaces."""
     things = parts(mi)
     meshes = [to_mitsuba(mi, f"part{i}", surface, bsdf) for i, (_, surface, bsdf) in enumerate(things)]
-    # parallel loading may put the lamps in another order: other samples
-    scene = mi.load_dict({"type": "scene", **lamps(mi), **{f"part{i}": mesh for i, mesh in enumerate(meshes)}}, parallel=False)
+    scene = load_scene(mi, {**lamps(mi), **{f"part{i}": mesh for i, mesh in enumerate(meshes)}})
     shapes = {shape.id(): shape for shape in scene.shapes()}
     labelled = [(shapes[f"part{i}"], LABELS.index(name)) for i, (name, _, _) in enumerate(things)]
     return scene, labelled, [(name, surface) for name, surface, _ in things]

@@ -520,8 +520,8 @@ def describe(made: Design, sensors: list[RigSensor], gains: dict[str, float], no
 
 def build_scene(mi: Any, made: Design) -> tuple[Any, list[tuple[Any, int]]]:
     """Mitsuba scene and (shape, label) pairs."""
-    content: dict[str, Any] = {"type": "scene"}
-    for i, lamp in enumerate(made.lamps):
+    content: dict[str, Any] = {}
+    for i, lamp in reversed(list(enumerate(made.lamps))):  # the light from everywhere first
         emitter: dict[str, Any] = {"type": "constant" if lamp.position is None else "area", "radiance": spectrum(lamp.radiance())}
         emitter["sampling_weight"] = lamp.share
         if lamp.position is None:
@@ -532,7 +532,7 @@ def build_scene(mi: Any, made: Design) -> tuple[Any, list[tuple[Any, int]]]:
         content[f"lamp{i}"] = {"type": "rectangle", "to_world": place, "emitter": emitter}
     for i, t in enumerate(made.things):
         content[f"part{i}"] = example.to_mitsuba(mi, f"part{i}", t.surface, t.bsdf(mi))
-    scene = mi.load_dict(content, parallel=False)  # the same order of lamps, so the same samples, every time
+    scene = example.load_scene(mi, content)
     shapes = {shape.id(): shape for shape in scene.shapes()}
     return scene, [(shapes[f"part{i}"], i + 1) for i in range(len(made.things))]
 
