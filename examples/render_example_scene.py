@@ -24,7 +24,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,14 +57,14 @@ LABELS = ("background", "table", "vase", "duck", "sphere_a", "sphere_b", "pawn",
 # --------------------------------------------------------------------------------------------------------- spectra
 
 
-def bump(centre: float, sigma: float) -> np.ndarray:
-    """Gaussian of height 1 at WAVELENGTHS."""
-    return np.exp(-0.5 * ((WAVELENGTHS - centre) / sigma) ** 2)
+def bump(centre: float, sigma: float, nm: np.ndarray = WAVELENGTHS) -> np.ndarray:
+    """Gaussian of height 1."""
+    return np.exp(-0.5 * ((nm - centre) / sigma) ** 2)
 
 
-def step(centre: float, width: float) -> np.ndarray:
-    """Sigmoid from 0 to 1 at WAVELENGTHS."""
-    return 1.0 / (1.0 + np.exp(-(WAVELENGTHS - centre) / width))
+def step(centre: float, width: float, nm: np.ndarray = WAVELENGTHS) -> np.ndarray:
+    """Sigmoid from 0 to 1."""
+    return 1.0 / (1.0 + np.exp(-(nm - centre) / width))
 
 
 def lamp() -> np.ndarray:
@@ -124,10 +124,10 @@ def reflectances() -> dict[str, np.ndarray]:
     return paints
 
 
-def spectrum(values: np.ndarray) -> dict[str, Any]:
-    """Mitsuba spectrum of values at WAVELENGTHS."""
+def spectrum(values: np.ndarray, nm: np.ndarray = WAVELENGTHS) -> dict[str, Any]:
+    """Mitsuba spectrum of values at evenly spaced wavelengths."""
     text = ", ".join(f"{value:.5f}" for value in values)
-    return {"type": "regular", "wavelength_min": WAVELENGTHS[0], "wavelength_max": WAVELENGTHS[-1], "values": text}
+    return {"type": "regular", "wavelength_min": nm[0], "wavelength_max": nm[-1], "values": text}
 
 
 # ---------------------------------------------------------------------------------------------------------- meshes
@@ -347,13 +347,13 @@ def load_mitsuba(variant: str = "llvm_ad_spectral_polarized") -> Any:
     return mitsuba
 
 
-def matte(paint: np.ndarray) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": spectrum(paint)}
+def matte(paint: np.ndarray, nm: np.ndarray = WAVELENGTHS) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": spectrum(paint, nm)}
 
 
-def coated(paint: np.ndarray, roughness: float = 0.12) -> dict[str, Any]:
+def coated(paint: np.ndarray, roughness: float = 0.12, nm: np.ndarray = WAVELENGTHS) -> dict[str, Any]:
     """A smooth or rough dielectric coat (n = 1.5) over a diffuse body; polarizes."""
-    return {"type": "pplastic", "diffuse_reflectance": spectrum(paint), "int_ior": 1.5, "alpha": roughness}
+    return {"type": "pplastic", "diffuse_reflectance": spectrum(paint, nm), "int_ior": 1.5, "alpha": roughness}
 
 
 def blended(mi: Any, weight: np.ndarray, first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
@@ -419,9 +419,9 @@ def lamps(mi: Any) -> dict[str, Any]:
     white = np.ones_like(WAVELENGTHS)
     # position [m], half edge [m], radiance, share of the light on the table (where to send samples)
     boxes = {
-        "key": ((0.75, -0.55, 0.95), 0.26, 7.5, 0.45),
-        "fill": ((-0.95, 0.1, 0.75), 0.3, 2.2, 0.18),
         "rim": ((0.1, 0.95, 0.8), 0.2, 4.5, 0.16),
+        "fill": ((-0.95, 0.1, 0.75), 0.3, 2.2, 0.18),
+        "key": ((0.75, -0.55, 0.95), 0.26, 7.5, 0.45),
     }
     out: dict[str, Any] = {"sky": {"type": "constant", "radiance": spectrum(0.12 * white), "sampling_weight": 0.21}}
     for name, (position, half, power, share) in boxes.items():
@@ -431,11 +431,16 @@ def lamps(mi: Any) -> dict[str, Any]:
     return out
 
 
+def load_scene(mi: Any, content: dict[str, Any]) -> Any:
+    """Mitsuba scene with its lamps in the order given, so samples are the same every time: the optimizer sorts them by addresses."""
+    return mi.load_dict({"type": "scene", **content}, optimize=False)
+
+
 def build_scene(mi: Any) -> tuple[Any, list[tuple[Any, int]], list[tuple[str, Surface]]]:
     """Mitsuba scene, (shape, label) pairs and the surfaces."""
     things = parts(mi)
     meshes = [to_mitsuba(mi, f"part{i}", surface, bsdf) for i, (_, surface, bsdf) in enumerate(things)]
-    scene = mi.load_dict({"type": "scene", **lamps(mi), **{f"part{i}": mesh for i, mesh in enumerate(meshes)}})
+    scene = load_scene(mi, {**lamps(mi), **{f"part{i}": mesh for i, mesh in enumerate(meshes)}})
     shapes = {shape.id(): shape for shape in scene.shapes()}
     labelled = [(shapes[f"part{i}"], LABELS.index(name)) for i, (name, _, _) in enumerate(things)]
     return scene, labelled, [(name, surface) for name, surface, _ in things]
@@ -539,28 +544,29 @@ def rig_poses() -> list[np.ndarray]:
 # ------------------------------------------------------------------------------------------------------- rendering
 
 
-def wavelength_table(response: np.ndarray) -> np.ndarray:
+def wavelength_table(response: np.ndarray, nm: np.ndarray = WAVELENGTHS) -> np.ndarray:
     """Responses (C, wavelengths) → inverse cumulative distributions (C, TABLE_BINS + 1) [nm]."""
-    fine = np.linspace(WAVELENGTHS[0], WAVELENGTHS[-1], 8001)
+    fine = np.linspace(nm[0], nm[-1], 8001)
     out = []
     for curve in response:
-        density = np.interp(fine, WAVELENGTHS, curve)
+        density = np.interp(fine, nm, curve)
         total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
         keep = np.concatenate([[True], np.diff(total) > 0])
         out.append(np.interp(np.linspace(0, 1, TABLE_BINS + 1), total[keep] / total[-1], fine[keep]))
     return np.stack(out)
 
 
-def render(mi: Any, scene: Any, camera: Camera, pose: np.ndarray, table: np.ndarray, channel: np.ndarray, spp: int, seed: int,
-           clamp: float = np.inf) -> np.ndarray:  # fmt: skip
-    """Stokes images of a scene through a lens, noise-free but for the sampling.
+def trace(mi: Any, scene: Any, camera: Camera, pose: np.ndarray, spp: int, seed: int,
+          wavelengths: Callable[[Any, Any], list[Any]]) -> Iterator[tuple[list[Any], Any]]:  # fmt: skip
+    """Paths of a scene through a lens, in blocks of samples; the samples of a photosite lie beside each other (see `photosite_sums`).
 
     Args:
         pose: (4, 4) camera-to-scene, OpenCV axes.
-        table: (C, TABLE_BINS + 1) of `wavelength_table`. channel: (H, W) int, the channel each photosite measures.
-        spp: samples per pixel, a square number. clamp: limit of S0 of one sample at one wavelength.
-    Returns:
-        (H, W, 3) float64: S0, S1, S2 in the axes of `mmsynth.sensors.polarization` (x̂ = camera x ⟂ ray, ŷ = image up).
+        spp: samples per pixel, a square number.
+        wavelengths: (index of the photosite, a random number in [0, 1)) → four wavelengths [nm] of each sample. Which way a path goes does
+            not depend on them: the same seed gives the same paths.
+    Yields:
+        The wavelengths, and the paths' Mueller matrices to the axes of `mmsynth.sensors.polarization` (x̂ = camera x ⟂ ray, ŷ = image up).
     """
     import drjit as dr
 
@@ -578,9 +584,7 @@ def render(mi: Any, scene: Any, camera: Camera, pose: np.ndarray, table: np.ndar
     sampler.set_samples_per_wavefront(block)
     sampler.seed(seed, pixels * block)
     matrix = [[dr.opaque(mi.Float, float(pose[i, j])) for j in range(4)] for i in range(3)]
-    nanometres, channels = mi.Float(table.ravel()), mi.UInt32(channel.ravel())
-    limit, width = dr.opaque(mi.Float, min(clamp, 1e30)), dr.opaque(mi.UInt32, camera.width)
-    total = np.zeros((pixels, 3))
+    width = dr.opaque(mi.UInt32, camera.width)
     for _ in range(spp // block):
         pixel = dr.arange(mi.UInt32, pixels * block) // block  # the sampler's own layout
         column, row = pixel % width, pixel // width
@@ -592,25 +596,57 @@ def render(mi: Any, scene: Any, camera: Camera, pose: np.ndarray, table: np.ndar
             bottom = dr.lerp(dr.gather(mi.Float, values, corner + width + 1), dr.gather(mi.Float, values, corner + width + 2), fx)
             ideal.append(dr.lerp(top, bottom, fy))
         direction = dr.normalize(mi.Vector3f(*[m[0] * ideal[0] + m[1] * ideal[1] + m[2] for m in matrix]))
-        # four stratified draws from the photosite's response
         ray = mi.RayDifferential3f(mi.Point3f(*[m[3] + dr.zeros(mi.Float, pixels * block) for m in matrix]), direction)
-        shift, own = sampler.next_1d(), dr.gather(mi.UInt32, channels, pixel) * (TABLE_BINS + 1)
+        chosen = wavelengths(pixel, sampler.next_1d())
         for k in range(4):
-            position = (k + shift) / 4 * TABLE_BINS
-            cell = dr.minimum(mi.UInt32(position), TABLE_BINS - 1)
-            below, above = dr.gather(mi.Float, nanometres, own + cell), dr.gather(mi.Float, nanometres, own + cell + 1)
-            ray.wavelengths[k] = dr.lerp(below, above, position - mi.Float(cell))
+            ray.wavelengths[k] = chosen[k]
         mueller, _, _ = integrator.sample(scene, sampler, ray)
         # Mitsuba's Stokes frame: light travels along -direction; turn its basis to the camera's x axis
         camera_x = mi.Vector3f(*[m[0] for m in matrix])
         x_axis = dr.normalize(camera_x - dr.dot(camera_x, direction) * direction)
-        mueller = mi.mueller.rotate_stokes_basis(-direction, mi.mueller.stokes_basis(-direction), x_axis) @ mueller
-        shrink = dr.minimum(1.0, limit / dr.maximum(mueller[0, 0], 1e-20))
-        stokes = [dr.mean(mueller[i, 0] * shrink) for i in range(3)]
-        dr.eval(*stokes)
-        total += np.stack([np.array(s, dtype=np.float64).reshape(pixels, block).sum(1) for s in stokes], -1)
+        yield chosen, mi.mueller.rotate_stokes_basis(-direction, mi.mueller.stokes_basis(-direction), x_axis) @ mueller
         sampler.advance()
         sampler.schedule_state()
+
+
+def photosite_sums(values: list[Any], camera: Camera) -> np.ndarray:
+    """Numbers of each sample of a block of `trace` → (photosites, numbers) float64, summed over the samples."""
+    import drjit as dr
+
+    dr.eval(*values)
+    return np.stack([np.array(v, dtype=np.float64).reshape(camera.width * camera.height, -1).sum(1) for v in values], -1)
+
+
+def render(mi: Any, scene: Any, camera: Camera, pose: np.ndarray, table: np.ndarray, channel: np.ndarray, spp: int, seed: int,
+           clamp: float = np.inf) -> np.ndarray:  # fmt: skip
+    """Stokes images of a scene through a lens, noise-free but for the sampling.
+
+    Args:
+        pose, spp: see `trace`.
+        table: (C, TABLE_BINS + 1) of `wavelength_table`. channel: (H, W) int, the channel each photosite measures.
+        clamp: limit of S0 of one sample at one wavelength.
+    Returns:
+        (H, W, 3) float64: S0, S1, S2 in the axes of `mmsynth.sensors.polarization`.
+    """
+    import drjit as dr
+
+    nanometres, channels = mi.Float(table.ravel()), mi.UInt32(channel.ravel())
+    limit = dr.opaque(mi.Float, min(clamp, 1e30))
+
+    def of_response(pixel: Any, shift: Any) -> list[Any]:
+        """Four stratified draws from the photosite's response."""
+        out, own = [], dr.gather(mi.UInt32, channels, pixel) * (TABLE_BINS + 1)
+        for k in range(4):
+            position = (k + shift) / 4 * TABLE_BINS
+            cell = dr.minimum(mi.UInt32(position), TABLE_BINS - 1)
+            below, above = dr.gather(mi.Float, nanometres, own + cell), dr.gather(mi.Float, nanometres, own + cell + 1)
+            out.append(dr.lerp(below, above, position - mi.Float(cell)))
+        return out
+
+    total = np.zeros((camera.width * camera.height, 3))
+    for _, mueller in trace(mi, scene, camera, pose, spp, seed, of_response):
+        shrink = dr.minimum(1.0, limit / dr.maximum(mueller[0, 0], 1e-20))
+        total += photosite_sums([dr.mean(mueller[i, 0] * shrink) for i in range(3)], camera)
     return (total / spp).reshape(camera.height, camera.width, 3)
 
 
