@@ -198,6 +198,7 @@ def prior(
     out: Annotated[Path, typer.Option(help="the file to write")] = Path("prior.safetensors"),
     budget: Annotated[str | None, typer.Option(help="time of the fit of each scene, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="or its optimiser steps")] = None,
+    truth: Annotated[bool, typer.Option("--truth", help="do not fit scenes: take the aligned truth in their gt folders")] = False,
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     as_json: JsonOption = False,
@@ -209,7 +210,14 @@ def prior(
 
     seconds = fit_length(steps, budget)
     made = make_prior(
-        sources, out, budget=seconds, steps=steps, seed=seed, device=pick_device(device), say=(lambda text: None) if as_json else print
+        sources,
+        out,
+        budget=seconds,
+        steps=steps,
+        seed=seed,
+        device=pick_device(device),
+        truth=truth,
+        say=(lambda text: None) if as_json else print,
     )
     if as_json:
         print(json.dumps({"prior": str(out), "scenes": list(made.scenes), "modalities": list(made.sensors)}))

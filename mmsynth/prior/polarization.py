@@ -8,6 +8,7 @@ a small network that many scenes have taught gives q, S1 over S0 about that plan
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -86,7 +87,9 @@ def learn_polarization(inputs: Tensor, q: Tensor, level: Tensor, seed: int = 0) 
     Args:
         inputs: (N, INPUTS) of all scenes. q: (N,) what it should say. level: (N,) S0 over its scene's mean: dark pixels say little.
     """
-    centre, scale = inputs.mean(0), inputs.std(0).clamp(min=1e-3)
+    centre, scale = inputs.mean(0), inputs.std(0)
+    # what was always the same says nothing, whatever it is elsewhere
+    scale = torch.where(scale > 1e-6, scale.clamp(min=1e-3), torch.full_like(scale, math.inf))
     normal = ((inputs - centre) / scale).clamp(-_RANGE, _RANGE)
     generator = torch.Generator().manual_seed(seed)
     sizes = ((_HIDDEN, INPUTS), (_HIDDEN, _HIDDEN), (2, _HIDDEN))

@@ -253,7 +253,7 @@ def _listed(sensors: Mapping[str, Sensor]) -> str:
 def predict(prior: Prior, facts: SceneFacts, measured: Sequence[str]) -> Prediction:
     """Make a prior ready for a scene that has the modalities ``measured``: all others that a scene of the prior had beside them are
     predicted."""
-    columns, indices = columns_of(prior.sensors), np.arange(len(prior.spectra.usual))
+    columns, indices = columns_of(prior.sensors), np.arange(prior.spectra.usual.shape[1])
     given = np.concatenate([indices[columns[name]] for name in facts.known])
     # of what no scene had beside the known, nothing is known
     met = np.isfinite(prior.spectra.moments[given]).all(0)

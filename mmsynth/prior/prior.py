@@ -43,7 +43,7 @@ class Prior:
     @property
     def colour(self) -> np.ndarray:
         """Three columns that tell colours: the first, middle and last of the first modality with three channels or more, or fewer."""
-        columns, indices = columns_of(self.sensors), np.arange(len(self.spectra.usual))
+        columns, indices = columns_of(self.sensors), np.arange(self.spectra.usual.shape[1])
         several = [name for name, sensor in self.sensors.items() if not sensor.is_polarization and sensor.channel_count >= 3]
         of = indices[columns[several[0]]] if several else indices
         return of[[0, len(of) // 2, len(of) - 1]]
@@ -90,7 +90,7 @@ def _learn_polarization(prior: Prior, scenes: Sequence[SceneSamples], seed: int)
         if name is None or scene.polarized is None or scene.shapes is None:
             continue
         white = white_of(prior.spectra, columns, list(scene.body), scene)
-        body = np.full((len(scene.images), len(prior.spectra.usual)), np.nan)
+        body = np.full((len(scene.images), prior.spectra.usual.shape[1]), np.nan)
         for other, light in scene.body.items():
             body[:, columns[other]] = light / np.exp(white.log[columns[other]])
         level = np.nanmean(body)

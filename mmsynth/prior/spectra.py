@@ -30,10 +30,11 @@ _CLUSTERS = 256  # in all
 _LEAST_PIXELS = 5  # of a cluster
 _DARK = 0.03  # of the scene's mean, below which light has no colour
 _BRIGHT = 4.0  # chromaticity, above which a channel is as good as alone
-_RIDGE = 1e-3  # of the mean square of a known channel
+_RIDGE = 1e-4  # of the mean square of a known channel
 _WIDTH = 0.05  # of the kernel, in chromaticity over the mean channel
 _SHRINK = 0.08  # clusters' worth of "as the linear map has it", for each scene
 _FAR = 3.0  # kernel widths from the nearest cluster, at which the deviation has grown by sqrt(2)
+_COLOUR_ERROR = 0.3  # of the log of the mean colour, where too few scenes tell
 _LAMP_ERROR = 0.03  # of the log of a lamp's spectrum, at the least
 _STEADY = 1e-3  # mean square of whites off their mean, below which there is no line
 _UNKNOWN_GAIN = 0.5  # deviation of the log
@@ -44,7 +45,8 @@ class Spectra:
     """Statistics of C channels, the columns of ``columns_of`` the prior's sensors. NaN: no scene has both, or a cluster's scene has not.
 
     Attributes:
-        moments: (C, C), mean over scenes of r rᵀ, scenes scaled to mean 1. usual: (C,) log of the mean r.
+        moments: (C, C), mean over scenes of r rᵀ, scenes scaled to mean 1. usual: (2, C) log of the mean r, and its deviation between
+            scenes.
         mean, spread: (K, C) of r over its mean channel, of clusters; spread is a variance. share: (K,) of their scene's pixels.
         scenes: how many were learned from.
         line: (3, C), a, b and the deviation from the line of log white over gain. raw: (2, C), mean and deviation of log white where
@@ -85,8 +87,9 @@ def learn_spectra(sensors: Mapping[str, Sensor], scenes: Sequence[SceneSamples],
     lamps = [_lamp_of(columns, scene, count) for scene in scenes]
     known = [i for i, lamp in enumerate(lamps) if lamp is not None]
     # the colour of a mean surface, from scenes whose lamps are known
-    usual = np.nanmean(_centred(np.stack([log_mean[i] - lamps[i] for i in known])), 0) if known else np.zeros(count)
-    whites = _centred(np.stack([lamp if lamp is not None else mean - usual for lamp, mean in zip(lamps, log_mean, strict=True)]))
+    colour = _centred(np.stack([log_mean[i] - lamps[i] for i in known])) if known else np.zeros((1, count))
+    usual = np.stack([np.nanmean(colour, 0), np.nanstd(colour, 0) if len(colour) > 2 else np.full(count, _COLOUR_ERROR)])
+    whites = _centred(np.stack([lamp if lamp is not None else mean - usual[0] for lamp, mean in zip(lamps, log_mean, strict=True)]))
     moments, pairs = np.zeros((count, count)), np.zeros((count, count))
     means, spreads, shares = [], [], []
     per_scene = max(4, _CLUSTERS // len(scenes))
@@ -118,15 +121,17 @@ def learn_spectra(sensors: Mapping[str, Sensor], scenes: Sequence[SceneSamples],
 
 def white_of(spectra: Spectra, columns: Mapping[str, slice], known: Sequence[str], scene: SceneSamples) -> White:
     """White of a scene in all channels, from what is stated, from its lamps, or from its mean colour in the ``known`` modalities."""
-    count = len(spectra.usual)
+    count = spectra.usual.shape[1]
     given = np.concatenate([np.arange(count)[columns[name]] for name in known])
     boards = _joined_logs(columns, scene.exposure.white, count)
+    noise = np.maximum(spectra.line[2], _LAMP_ERROR)
     if np.isfinite(boards[given]).all():
         log, how = boards, "a white board"
     elif scene.lamp is not None:
         log, how = _joined_logs(columns, scene.lamp, count), "the lamps that surfaces mirror"
     else:
-        log, how = _log_mean(_joined(columns, scene.body, count)) - spectra.usual, "the mean colour"
+        log, how = _log_mean(_joined(columns, scene.body, count)) - spectra.usual[0], "the mean colour"
+        noise = np.hypot(noise, spectra.usual[1])
     log = log - log[given].mean()
     # the colour of known channels gives the place on the line, whatever their gains
     a, b, off = spectra.line
@@ -136,15 +141,21 @@ def white_of(spectra: Spectra, columns: Mapping[str, slice], known: Sequence[str
         of = np.arange(count)[columns[name]]
         if on_line[of].all():
             slope, rest = b[of] - b[of].mean(), (log - a)[of] - (log - a)[of].mean()
-            noise = np.maximum(off[of], _LAMP_ERROR) ** 2
-            square, product = square + float((slope**2 / noise).sum()), product + float((slope * rest / noise).sum())
+            square += float((slope**2 / noise[of] ** 2).sum())
+            product += float((slope * rest / noise[of] ** 2).sum())
     gains = _log_gains(columns, scene, count)
     line = a + b * product / (square + 1.0) + gains
     anchors = given[np.isfinite(line[given])]
     level = float((log - line)[anchors].mean()) if len(anchors) else np.nan
+    if how == "the mean colour":  # of a few things it says less than what lamps are like
+        for name in known:
+            of = np.arange(count)[columns[name]]
+            if on_line[of].all():
+                on = (a + b * product / (square + 1.0))[of]
+                log[of] = on - on.mean() + log[of].mean()
     free = ~np.isfinite(line + level)
     expected = np.where(free, spectra.raw[0] + float((log - spectra.raw[0])[given].mean()), line + level)
-    deviation = np.where(free, spectra.raw[1], off)
+    deviation = np.where(free, spectra.raw[1], np.sqrt(off**2 + b**2 / (square + 1.0)))
     measured = np.isin(np.arange(count), given) | (np.isfinite(boards) & (how == "a white board"))
     return White(np.where(measured, log, expected), np.where(measured, 0.0, deviation), free & ~measured, how)
 

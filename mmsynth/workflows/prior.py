@@ -13,6 +13,7 @@ from mmsynth.prior.prior import Prior, learn_prior, load_prior, save_prior
 from mmsynth.scene.exposure import stated_exposure
 from mmsynth.scene.load import load_scene
 from mmsynth.workflows.runs import Run, is_run, open_run
+from mmsynth.workflows.truth_samples import sample_truth
 
 
 def make_prior(
@@ -23,6 +24,7 @@ def make_prior(
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
+    truth: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> Prior:
     """Learn a prior from runs, and from scenes, which are fitted first, and write it.
@@ -30,15 +32,20 @@ def make_prior(
     Args:
         sources: run folders or scenes, each with several modalities. budget, steps, device: of the fits of scenes, see ``fit``; their
             runs are
-            in ``OUT's folder/prior_runs/SCENE`` and are taken again where they are finished. say: told one line a source.
+            in ``OUT's folder/prior_runs/SCENE`` and are taken again where they are finished. truth: do not fit scenes, take
+            their ``gt/aligned`` and ``gt/geometry``: a second each, but nothing is known of gloss. say: told one line a source.
     Raises:
         InputError: no sources, one that is neither run nor scene or has one modality, or the file cannot be written.
     """
     if not sources:
         raise InputError("prior: no scenes, expected runs or scenes with several modalities.")
-    runs = [_run_of(source, out.parent / "prior_runs", budget, steps, seed, device, say) for source in sources]
     samples = []
-    for run in runs:
+    for source in sources:
+        if truth and not is_run(source):
+            samples.append(sample_truth(load_scene(source), seed=seed))
+            say(f"{source}: {len(samples[-1].images):,} pixels of {', '.join(samples[-1].sensors)}")
+            continue
+        run = _run_of(source, out.parent / "prior_runs", budget, steps, seed, device, say)
         frames = run.scene.frames_of(run.field.measured[0], run.scene.split.train)
         samples.append(sample_field(run.field, frames, run.scene.root.resolve().name, stated_exposure(run.scene), seed=seed))
         say(f"{run.folder}: {len(samples[-1].images):,} rays of {', '.join(run.field.measured)}")

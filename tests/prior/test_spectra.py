@@ -9,7 +9,7 @@ from painted_rooms import SENSORS, black_body, room, white
 from scipy.stats import linregress
 
 from mmsynth.prior.samples import columns_of
-from mmsynth.prior.spectra import Spectra, White, learn_spectra, spectral_map, white_of
+from mmsynth.prior.spectra import _RIDGE, Spectra, White, learn_spectra, spectral_map, white_of
 
 KNOWN = {n: SENSORS[n] for n in ("rgb", "nir", "ms")}
 COLUMNS = columns_of(KNOWN)
@@ -75,7 +75,7 @@ def test_without_lamps_white_is_from_the_mean_colour(spectra: Spectra) -> None:
 
 
 def test_the_map_is_homogeneous_and_never_negative(spectra: Spectra) -> None:
-    count = len(spectra.usual)
+    count = spectra.usual.shape[1]
     one = White(np.zeros(count), np.zeros(count), np.zeros(count, bool), "")
     mapped = spectral_map(spectra, one, np.arange(3), np.arange(3, count))
     light = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) + 0.01
@@ -89,12 +89,12 @@ def test_the_map_is_homogeneous_and_never_negative(spectra: Spectra) -> None:
 
 
 def test_without_clusters_the_map_is_least_squares(spectra: Spectra) -> None:
-    count = len(spectra.usual)
+    count = spectra.usual.shape[1]
     empty = Spectra(spectra.moments, spectra.usual, np.zeros((0, count)), np.zeros((0, count)), np.zeros(0), 4, spectra.line, spectra.raw)
     one = White(np.zeros(count), np.zeros(count), np.zeros(count, bool), "")
     mapped = spectral_map(empty, one, np.arange(3), np.arange(3, count))
     root = np.linalg.cholesky(spectra.moments + 1e-12 * np.eye(count)).T  # rows whose second moments these are
-    ridge = (1e-3 * np.trace(spectra.moments[:3, :3]) / 3) ** 0.5 * np.eye(3)
+    ridge = (_RIDGE * np.trace(spectra.moments[:3, :3]) / 3) ** 0.5 * np.eye(3)
     expected = np.linalg.lstsq(np.vstack([root[:, :3], ridge]), np.vstack([root[:, 3:], np.zeros((3, count - 3))]), rcond=None)[0]
     light = np.random.default_rng(0).uniform(0.2, 1.0, (50, 3))
     ours = mapped(torch.from_numpy(light).float())[0].numpy()
