@@ -67,15 +67,22 @@ def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
         lines.append(f"{pair['source']} to {pair['target']} ({views})")
         for name, m in pair["methods"].items():
             lines.append("".join([f"  {name:26s}"] + [f"{m[k]:12.3f}" if k in m else f"{'':12s}" for k in keys]))
-        lines.append(f"  {weights_text(pair['auto'], pair['evidence'])}")
+        why = "" if pair["evidence"] is not None else ", by the kind of the modalities: no training view has frames of both"
+        lines.append(f"  {_weights_text(pair['auto'], pair['evidence'])}{why}")
     return "\n".join(lines)
 
 
-def weights_text(weights: Mapping[str, float], evidence: Mapping[str, Any] | None) -> str:
-    """What ``auto`` took of each method, and why."""
+def converted_text(sidecars: Sequence[Mapping[str, Any]]) -> str:
+    """How frames were converted: the mean over their sidecars of how much of each method was taken, and why."""
+    names = {name: None for sidecar in sidecars for name in sidecar["weights"]}
+    mean = {name: sum(sidecar["weights"].get(name, 0.0) for sidecar in sidecars) / len(sidecars) for name in names}
+    return _weights_text(mean, sidecars[0]["evidence"])
+
+
+def _weights_text(weights: Mapping[str, float], evidence: Mapping[str, Any] | None) -> str:
     taken = " + ".join(f"{weight:.2f} {name}" for name, weight in sorted(weights.items(), key=lambda item: -item[1]) if weight >= 0.005)
     if evidence is None:
-        return f"auto: {taken}, by the kind of the modalities: no training view has frames of both"
+        return f"method: {taken}"
     scored = ", ".join(f"{name} {value:.1f}" for name, value in evidence["psnr"].items())
     lines = [f"auto: {taken}; dB at {len(evidence['views'])} training views: {scored}"]
     for name in evidence["light_moves"]:

@@ -42,7 +42,7 @@ OF_THE_SCENE: tuple[Prediction, ...] = ("linear", "nearest")
 """They need the scene's training frames."""
 WARPED_SHARE = 0.6
 """Of a correction is right where it arrives through the surface: measured, on two scenes with ground truth."""
-_LEARNED_FROM, _LEARNED_WIDTH = 8, 160  # renderings for the linear map, and px in a row of them
+_LEARNED_FROM, _LEARNED_WIDTH = 8, 80  # renderings for the linear map, and px in a row of them
 
 
 @dataclass(frozen=True)
