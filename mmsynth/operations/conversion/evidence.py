@@ -37,6 +37,7 @@ from mmsynth.operations.conversion.predictions import (
     Prediction,
     Training,
     compare,
+    in_one_place,
     learn_training,
     predict,
 )
@@ -125,7 +126,7 @@ def gather(field: Field, scene: Scene, source: str, target: str, lights: dict[st
     for frame in frames:
         raw, view = opened(field, frame, WINDOW)
         real, seen_by = opened(field, theirs[frame.view], WINDOW)
-        together &= view.camera == seen_by.camera and np.allclose(view.camera_to_world, seen_by.camera_to_world)
+        together &= in_one_place(view, seen_by)
         compared = compare(field, raw, view, source, target)
         said = predict(
             field, compared, source, target, names, training=training, seen_by=seen_by, left_out=frame.view, share=1.0, of_region=True

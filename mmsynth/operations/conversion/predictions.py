@@ -84,6 +84,11 @@ class Predictions:
     unexplained: np.ndarray
 
 
+def in_one_place(a: PosedCamera, b: PosedCamera) -> bool:
+    """Whether two cameras have the same pixels of the same scene: nothing is carried from one to the other."""
+    return a.camera == b.camera and np.allclose(a.camera_to_world, b.camera_to_world, rtol=0.0, atol=1e-9)
+
+
 def light_of(seen: Rendering, sensor: Sensor) -> np.ndarray:
     """(H, W, K) channels, of polarization Stokes (H, W, 3)."""
     return (seen.stokes[sensor.name] if sensor.is_polarization else seen.channels[sensor.name]).astype(np.float64)
@@ -168,7 +173,7 @@ def predict(
         mapped = np.concatenate([channels, np.ones((*channels.shape[:2], 1))], -1) @ training.matrix
     there, told, gain_sd, unexplained = seen, seen.valid & ~guidance.unexplained, guidance.gain_sd, guidance.unexplained
     covered = seen.valid
-    if seen_by is not None:
+    if seen_by is not None and not in_one_place(view, seen_by):
         there = field.render(seen_by.camera, seen_by.camera_to_world, [target], geometry=False, progress=progress)
         gain, colour = gain**share, colour * share
         layers, widths = (
