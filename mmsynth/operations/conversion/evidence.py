@@ -129,7 +129,7 @@ def gather(field: Field, scene: Scene, source: str, target: str, lights: dict[st
         together &= in_one_place(view, seen_by)
         compared = compare(field, raw, view, source, target)
         said = predict(
-            field, compared, source, target, names, training=training, seen_by=seen_by, left_out=frame.view, share=1.0, of_region=True
+            field, compared, source, target, names, training=training, seen_by=seen_by, left_out=frame.view, to_weigh=True, of_region=True
         )
         used = np.broadcast_to(said.there.valid.reshape(said.there.valid.shape + (1,) * (real.ndim - 2)), real.shape)
         used = used & (real < sensor.saturation)

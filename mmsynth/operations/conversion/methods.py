@@ -20,7 +20,6 @@ from mmsynth.operations.conversion.guidance import guide
 from mmsynth.operations.conversion.moving_light import MovingLight
 from mmsynth.operations.conversion.predictions import (
     OF_THE_SCENE,
-    WARPED_SHARE,
     Compared,
     Prediction,
     Predictions,
@@ -216,9 +215,8 @@ def convert_frame(
     field.check_modalities([source, target])
     chosen = method if isinstance(method, Chosen) else choose(field, None, source, target, method)
     compared = compare(field, raw, view, source, target, progress=progress)
-    share, weights = WARPED_SHARE, dict[Prediction, float]()
+    weights: dict[Prediction, float] = {}
     if chosen.evidence is not None:
-        share = 1.0  # what the way through the surface takes from a correction is in the evidence
         weights = chosen.evidence.weights(_prior_sd(field, compared, source), seen_by is not None)
     elif chosen.method != "auto":
         weights = {chosen.method: 1.0}
@@ -231,7 +229,7 @@ def convert_frame(
         training=chosen.training,
         seen_by=seen_by,
         left_out=left_out,
-        share=share,
+        to_weigh=chosen.evidence is not None,
         progress=progress,
     )
     return blended(field.sensors[target], chosen.method, compared, said, weights)

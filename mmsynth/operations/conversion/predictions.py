@@ -101,6 +101,21 @@ def as_light(values: np.ndarray, sensor: Sensor) -> np.ndarray:
     return intensities_to_stokes(torch.from_numpy(np.asarray(values, np.float64)), sensor.polarizer_angles_deg).numpy()
 
 
+def _physical(light: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Stokes vectors (..., 3) no more polarized than they are bright; means of such are so, too. Other light is left as it is."""
+    if not sensor.is_polarization:
+        return light
+    s0, linear = np.maximum(light[..., :1], 0.0), light[..., 1:]
+    return np.concatenate([s0, linear * np.minimum(1.0, s0 / np.maximum(np.linalg.norm(linear, axis=-1, keepdims=True), 1e-12))], -1)
+
+
+def _polarized_as(light: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Stokes vectors (..., 3) of the S0 of one and the polarization of another."""
+    return np.maximum(light[..., :1], 0.0) * np.concatenate(
+        [np.ones_like(other[..., :1]), other[..., 1:] / np.maximum(other[..., :1], 1e-9)], -1
+    )
+
+
 def learn_training(field: Field, scene: Scene, source: str, target: str) -> Training:
     """From the scene's training frames, small renderings of eight of them.
 
@@ -147,7 +162,7 @@ def predict(
     training: Training | None = None,
     seen_by: PosedCamera | None = None,
     left_out: int | None = None,
-    share: float = WARPED_SHARE,
+    to_weigh: bool = False,
     of_region: bool = False,
     progress: RaysDone | None = None,
 ) -> Predictions:
@@ -155,7 +170,9 @@ def predict(
 
     Args:
         training: for the methods ``OF_THE_SCENE``. seen_by: camera and pose of the target, None: the source's own pixels. left_out: view
-            whose frame ``nearest`` must not use. share: of a correction that is taken where it arrives through the surface.
+            whose frame ``nearest`` must not use. to_weigh: as evidence weighs them: a correction arrives
+            through the surface in full, as what that costs is seen, and of polarization ``linear`` and ``nearest`` say S0 alone, as they
+            know DoLP and AoLP less than the field does.
         of_region: of the nearest frame, too, use only a window around the region of interest.
     """
     sensor, seen, guidance, view = field.sensors[target], compared.seen, compared.guidance, compared.view
@@ -175,6 +192,7 @@ def predict(
     covered = seen.valid
     if seen_by is not None and not in_one_place(view, seen_by):
         there = field.render(seen_by.camera, seen_by.camera_to_world, [target], geometry=False, progress=progress)
+        share = 1.0 if to_weigh else WARPED_SHARE
         gain, colour = gain**share, colour * share
         layers, widths = (
             [gain, colour, mapped, gain_sd, seen.valid, unexplained],
@@ -193,10 +211,12 @@ def predict(
     if "guided" in methods:
         light["guided"], where["guided"] = corrected + np.where(told[..., None], colour, 0.0), told
     if "linear" in methods:
-        light["linear"], where["linear"] = np.where(covered[..., None], mapped, field_says), covered
+        light["linear"], where["linear"] = np.where(covered[..., None], _physical(mapped, sensor), field_says), covered
     if "nearest" in methods:
         assert training is not None
         light["nearest"], where["nearest"] = _nearest(field, training.frames, sensor, there, seen_by or view, left_out, of_region)
+    if to_weigh and of_light:
+        light |= {name: _polarized_as(light[name], field_says) for name in OF_THE_SCENE if name in light}
     return Predictions(there, light, where, gain_sd, unexplained)
 
 
@@ -220,4 +240,4 @@ def _nearest(
     seen = field.render(view.camera, view.camera_to_world, [], geometry=False)
     values = as_light(channels_of(raw, sensor.mosaic), sensor)
     carried, visible = warped(np.where(seen.valid[..., None], values, 0.0), seen, view, there, seen_by)
-    return np.where(visible[..., None], carried, field_says), visible
+    return np.where(visible[..., None], _physical(carried, sensor), field_says), visible

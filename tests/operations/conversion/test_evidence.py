@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion.evidence import Evidence, _bounded, gather
-from mmsynth.operations.conversion.methods import choose, convert_frame
+from mmsynth.operations.conversion.methods import Chosen, choose, convert_frame
 from mmsynth.operations.conversion.predictions import Training
 from mmsynth.operations.conversion.windows import opened
 from mmsynth.scene.images import load_frame
@@ -43,6 +43,23 @@ def test_a_right_field_is_believed_and_a_wrong_one_is_mended(scene: Any) -> None
         assert right.weights(0.0, carried=True) == {"field": 1.0}
         found = wrong.weights(0.0, carried=False)
         assert sum(found.values()) == pytest.approx(1.0) and max(found, key=lambda name: found[name]) != "field"
+
+
+def test_weights_leave_polarization_to_the_field(scene: Any) -> None:
+    """Whatever part of linear and nearest is taken, DoLP and AoLP are those of the field."""
+    field, frame = _field(WrongField), scene.frames_of("mono")[6]
+    found = gather(field, scene, "mono", "pol")
+    assert found is not None
+    forced = Evidence(**{**vars(found), "gram": np.eye(3), "product": np.full(3, 0.25)})
+    raw, view = opened(field, frame)
+    how: Any = {"source": "mono", "target": "pol"}
+    mixed = convert_frame(field, raw, view, method=Chosen("auto", found.training, forced), **how)
+    assert mixed.weights == pytest.approx({"field": 1 - 0.5 - 0.25 / 0.6, "linear": 0.25, "nearest": 0.25, "ratio": 0.25 / 0.6}, abs=1e-4)
+    assert mixed.stokes is not None
+    alone = convert_frame(field, raw, view, method="field", **how)
+    lit = alone.stokes[..., 0] > 0.1  # type: ignore[index]
+    ratio = mixed.stokes[..., :1] / alone.stokes[..., :1]  # type: ignore[index]
+    np.testing.assert_allclose(mixed.stokes[lit], (ratio * alone.stokes)[lit], atol=1e-5)  # type: ignore[operator]
 
 
 def test_weights_are_the_bounded_least_squares() -> None:
