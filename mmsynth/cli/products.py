@@ -40,7 +40,7 @@ def convert(
     target: Annotated[str, typer.Option("--to", help="modality to synthesise")],
     run: RunOption = None,
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: all frames of the source")] = None,
-    method: Annotated[str, typer.Option(help="auto, field, ratio or guided")] = "auto",
+    method: Annotated[str, typer.Option(help="auto, field, ratio, guided, linear or nearest")] = "auto",
     images: Annotated[
         list[Path] | None,
         typer.Option(help="frames of the source without poses, one option for each file; with --poses: matched to the poses by name"),
@@ -56,7 +56,9 @@ def convert(
     as_json: JsonOption = False,
 ) -> None:
     """Convert frames of one modality into another, at the frames' poses or at any poses."""
+    from mmsynth.files import read_json
     from mmsynth.operations.conversion.files import convert_files
+    from mmsynth.report.text import converted_text
     from mmsynth.scene.scene import canonical_modality
     from mmsynth.workflows.runs import open_run
 
@@ -70,6 +72,8 @@ def convert(
             field, scene, destination, source=source, target=target, frames=view_ids(views), views=poses, images=images or (),
             method=cast("Method", method), as_sensor=as_sensor, file_format=cast("RecordFormat", file_format), progress=show,
         )  # fmt: skip
+    if not as_json:
+        print(converted_text([read_json(path) for path in written if path.suffix == ".json"]))
     print_written(destination, written, as_json)
 
 

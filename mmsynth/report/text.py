@@ -68,7 +68,7 @@ def score_text(scores: Mapping[str, Any]) -> str:
 
 
 def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
-    """The result of ``evaluate --convert``: per pair a row for each method and baseline; "auto" marks the one that it stands for."""
+    """The result of ``evaluate --convert``: per pair a row for each method, what ``auto`` made of them, and what it went by."""
     columns = {
         "psnr": "psnr [dB]", "psnr_region": "region", "ssim": "ssim", "sam": "sam [deg]", "ergas": "ergas", "stokes_rmse": "stokes rmse",
         "dolp_rmse": "dolp rmse", "aolp_mae": "aolp [deg]",
@@ -79,9 +79,29 @@ def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:
         views = f"{len(pair['views'])} frames, truth: {pair['truth']}, {pair['seconds_per_frame']:.2f} s a frame"
         lines.append(f"{pair['source']} to {pair['target']} ({views})")
         for name, m in pair["methods"].items():
-            label = f"  {name}{' (auto)' if name == pair['auto'] else ''}"
-            lines.append("".join([f"{label:28s}"] + [f"{m[k]:12.3f}" if k in m else f"{'':12s}" for k in keys]))
+            lines.append("".join([f"  {name:26s}"] + [f"{m[k]:12.3f}" if k in m else f"{'':12s}" for k in keys]))
+        why = "" if pair["evidence"] is not None else ", by the kind of the modalities: no training view has frames of both"
+        lines.append(f"  {_weights_text(pair['auto'], pair['evidence'])}{why}")
     return "\n".join(lines)
+
+
+def converted_text(sidecars: Sequence[Mapping[str, Any]]) -> str:
+    """How frames were converted: the mean over their sidecars of how much of each method was taken, and why."""
+    names = {name: None for sidecar in sidecars for name in sidecar["weights"]}
+    mean = {name: sum(sidecar["weights"].get(name, 0.0) for sidecar in sidecars) / len(sidecars) for name in names}
+    return _weights_text(mean, sidecars[0]["evidence"])
+
+
+def _weights_text(weights: Mapping[str, float], evidence: Mapping[str, Any] | None) -> str:
+    taken = " + ".join(f"{weight:.2f} {name}" for name, weight in sorted(weights.items(), key=lambda item: -item[1]) if weight >= 0.005)
+    if evidence is None:
+        return f"method: {taken}"
+    scored = ", ".join(f"{name} {value:.1f}" for name, value in evidence["psnr"].items())
+    lines = [f"auto: {taken}; dB at {len(evidence['views'])} training views: {scored}"]
+    for name in evidence["light_moves"]:
+        light = evidence["light_of_the_camera"][name]
+        lines.append(f"{name}: its light seems to move with the camera (exponent of cos θ / d²: {light['share']:.2f} ± {light['sd']:.2f})")
+    return "; ".join(lines)
 
 
 def noise_text(calibrated: Mapping[str, Calibrated], out: Path) -> str:

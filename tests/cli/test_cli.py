@@ -146,15 +146,19 @@ def test_convert_at_poses(fitted: Path, tmp_path: Path) -> None:
     refused(here(fitted, "convert", "--from", "rgb", "--to", "pol", *orbit, "--views", "9"), "--views", "--poses")
 
 
+METHODS = ("ratio", "guided", "linear", "nearest")
+
+
 def test_evaluate_conversions(fitted: Path) -> None:
     result = run(fitted, "evaluate", "--convert", "rgb:ms,mono:pol", "--json")
     assert result.returncode == 0, result.stderr
     first, second = json.loads(result.stdout)["conversions"]
-    assert (first["source"], first["target"], first["truth"], first["auto"]) == ("rgb", "ms", "aligned", "guided")
-    assert {"field", "ratio", "guided", "linear", "nearest"} == set(second["methods"]) and second["truth"] == "own pose"
+    assert (first["source"], first["target"], first["truth"]) == ("rgb", "ms", "aligned")
+    assert sum(first["auto"].values()) == pytest.approx(1.0) and set(first["evidence"]["psnr"]) == {"field", *METHODS}
+    assert {"auto", "field", *METHODS} == set(second["methods"]) and second["truth"] == "own pose"
     assert {"psnr", "sam", "ergas", "ssim", "rmse"} <= set(first["methods"]["guided"])
     table = here(fitted, "evaluate", "--convert", "rgb:mono")
-    assert table.returncode == 0 and "ratio (auto)" in table.stdout
+    assert table.returncode == 0 and "\n  auto: " in table.stdout and "training views: field" in table.stdout
     refused(here(fitted, "evaluate", "--convert", "rgb-ms"), "rgb-ms", "rgb:ms")
     refused(here(fitted, "evaluate", "--convert", "rgb:thermal"), "thermal")
 

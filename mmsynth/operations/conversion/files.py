@@ -11,7 +11,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_json
-from mmsynth.operations.conversion.methods import Converted, Method, chosen_method, convert_frame, render_frame
+from mmsynth.operations.conversion.methods import Chosen, Converted, Method, choose, convert_frame, render_frame
 from mmsynth.operations.conversion.register import landmarks, register
 from mmsynth.operations.output import previews
 from mmsynth.operations.output.progress import Counter, Progress
@@ -92,22 +92,24 @@ def convert_files(
         elif method not in ("auto", "field"):
             raise InputError(f"convert: method '{method}' needs frames of {source}, expected images at the poses, or the method field.")
         else:
-            items, method, rays = [_Item(Path(view.name).stem, view) for view in at], "field", training_rays(field, scene)
+            items, rays = [_Item(Path(view.name).stem, view) for view in at], training_rays(field, scene)
     if as_sensor:
         items = [item if item.seen_by else replace(item, seen_by=on_the_rig(field, item.view, source, target)) for item in items]
-    return _convert_each(field, source, target, items, Path(out), method, file_format, progress, rays)
+    chosen = Chosen("field") if rays is not None else choose(field, scene, source, target, method)
+    return _convert_each(field, source, target, items, Path(out), chosen, file_format, progress, rays)
 
 
 @dataclass(frozen=True)
 class _Item:
     """What to convert: name of the results, camera and pose, the frame there, if there is one, camera and pose of the target if they are
-    others, and how the frame was registered."""
+    others, how the frame was registered, and the view id of one of the scene's."""
 
     name: str
     view: PosedCamera
     frame: Frame | None = None
     seen_by: PosedCamera | None = None
     registration: dict[str, Any] | None = None
+    scene_view: int | None = None
 
 
 def _of_scene(field: Field, scene: Scene, source: str, target: str, ids: Sequence[int] | None, as_sensor: bool) -> list[_Item]:
@@ -117,7 +119,7 @@ def _of_scene(field: Field, scene: Scene, source: str, target: str, ids: Sequenc
     for frame, view in zip(scene.frames_of(source, None if ids is None else tuple(ids)), views, strict=True):
         own = next(iter(scene.frames_of(target, (frame.view,))), None) if as_sensor else None
         seen_by = None if own is None else PosedCamera(own.camera, field.pose_of(own))
-        items.append(_Item(view.name, view, frame, seen_by))
+        items.append(_Item(view.name, view, frame, seen_by, scene_view=frame.view))
     return items
 
 
@@ -148,7 +150,7 @@ def _convert_each(
     target: str,
     items: Sequence[_Item],
     out: Path,
-    method: Method,
+    chosen: Chosen,
     file_format: RecordFormat,
     progress: Progress | None,
     rays: TrainingRays | None,
@@ -157,7 +159,6 @@ def _convert_each(
     sensor, folder = field.sensors[target], out / target
     if not items:
         raise InputError(f"convert to {target}: no views, expected at least one.")
-    used = chosen_method(method, field.sensors[source], sensor)
     pixels = lambda view: 0 if view is None else view.camera.width * view.camera.height
     costs = [pixels(item.view) + pixels(item.seen_by) for item in items]
     count = Counter(progress, sum(costs))
@@ -171,7 +172,17 @@ def _convert_each(
             made = render_frame(field, rays, at, target, progress=count)
         else:
             raw = load_frame(field.sensors[source], item.frame)[0]
-            made = convert_frame(field, raw, item.view, source=source, target=target, method=used, seen_by=item.seen_by, progress=count)
+            made = convert_frame(
+                field,
+                raw,
+                item.view,
+                source=source,
+                target=target,
+                method=chosen,
+                seen_by=item.seen_by,
+                left_out=item.scene_view,
+                progress=count,
+            )
         count(goal - count.done)
         sidecar = folder / f"{item.name}.json"
         # a stale sidecar must not vouch for new files if this run is cut off
@@ -186,6 +197,8 @@ def _convert_each(
             "from": source,
             "method": made.method,
             "predicted": made.deviation is not None,
+            "weights": made.weights,
+            "evidence": None if chosen.evidence is None else chosen.evidence.facts(),
             "frame_exposure": made.exposure,
             "guided": float(made.guided.mean()),
             "registration": item.registration,

@@ -1,11 +1,9 @@
-"""Scores of conversions on test views: every method, and baselines.
+"""Scores of conversions on test views: every method.
 
 Truth, in this order: noise-free light of the target at the source's own pose (``gt/aligned``), noise-free light at the target's own pose
 (``gt/<modality>``), else the target's raw test frame. In the last two the conversion is made as the target sensor.
 
-Baselines: ``field``, the rendering alone; ``linear``, the frame's values through one linear map, learned from the field's renderings of all
-training poses of the source (a colour matrix of the scene); ``nearest``, the nearest training frame of the target, carried over through
-the surface, and the field where that frame does not see it.
+``auto`` stands beside all that it weighs (``conversion.evidence``), the field alone included.
 
 Values are clipped to [0, 1]; PSNR, RMSE, SAM, Stokes and AoLP errors are over all pixels with a ray, ``psnr_region`` over those in the
 region of interest; SSIM is that of ``evaluate``, over pixels with a ray; ERGAS (of a ratio of 1) is torchmetrics'. Without truth, raw
@@ -23,50 +21,57 @@ import torch
 from torchmetrics.functional.image import error_relative_global_dimensionless_synthesis
 
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion.methods import METHODS, Converted, chosen_method, convert_frame, warp_through_surface
+from mmsynth.operations.conversion.methods import Converted, blended, choose, convert_frame
+from mmsynth.operations.conversion.moving_light import MovingLight
+from mmsynth.operations.conversion.predictions import PREDICTIONS, compare, learn_training, predict
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, PosedCamera, Scene, Sensor, canonical_modality
 from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim_of_channels
-from mmsynth.sensors.mosaic import channels_of, photosites_of
+from mmsynth.sensors.mosaic import photosites_of
 from mmsynth.sensors.polarization import (
     angle_of_linear_polarization,
     aolp_difference,
     degree_of_linear_polarization,
-    intensities_to_stokes,
     stokes_to_intensities,
 )
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
-_LEARNED_FROM = 8  # renderings for the linear map
-
 
 def evaluate_conversions(
     field: Field, scene: Scene, pairs: Sequence[tuple[str, str]], *, progress: Progress | None = None
 ) -> list[dict[str, Any]]:
     """``evaluate_conversion`` of pairs of source and target; progress: called with (pairs done, pairs in all)."""
-    out = []
+    out: list[dict[str, Any]] = []
+    lights: dict[str, MovingLight] = {}
     for done, (source, target) in enumerate(pairs, 1):
-        out.append(evaluate_conversion(field, scene, source, target))
+        out.append(evaluate_conversion(field, scene, source, target, lights=lights))
         if progress is not None:
             progress(done, len(pairs))
     return out
 
 
 def evaluate_conversion(
-    field: Field, scene: Scene, source: str, target: str, *, views: Sequence[int] | None = None, progress: Progress | None = None
+    field: Field,
+    scene: Scene,
+    source: str,
+    target: str,
+    *,
+    views: Sequence[int] | None = None,
+    lights: dict[str, MovingLight] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Score all methods and baselines of one pair.
+    """Score all methods of one pair.
 
     Args:
-        views: view ids; None: the scene's test views. progress: called with (frames done, frames in all).
+        views: view ids; None: the scene's test views. lights: see ``evidence.gather``. progress: called with (frames done, frames in all).
     Returns:
-        ``{"source", "target", "truth": "aligned" | "own pose" | "raw", "views": [...], "auto": method, "seconds_per_frame",
-        "methods": {name: {"psnr", "psnr_region", "ssim", "rmse": [per channel], "sam", "ergas", "stokes_rmse", "dolp_rmse", "aolp_mae",
-        "physical"}}}``.
+        ``{"source", "target", "truth": "aligned" | "own pose" | "raw", "views": [...], "auto": {method: weight}, "evidence":
+        ``Evidence.facts`` or None, "seconds_per_frame", "methods": {name: {"psnr", "psnr_region", "ssim", "rmse": [per channel], "sam",
+        "ergas", "stokes_rmse", "dolp_rmse", "aolp_mae", "physical"}}}``.
     Raises:
         InputError: unknown modality, or no frames of the source in these views.
     """
@@ -76,30 +81,35 @@ def evaluate_conversion(
     if not frames:
         raise InputError(f"{scene.root}: no frames of {source} in the test views, expected some to convert.")
     truth = GroundTruth(scene)
+    own_of = {f.view: f for f in scene.frames_of(target, tuple(f.view for f in frames))}
     aligned = source == "rgb" and all(target in truth.aligned(f.view) for f in frames)
-    matrix = _linear(field, scene, source, target)
+    # one kind of truth for all: figures of photosites with noise and of light are not pooled
+    kind = "aligned" if aligned else "own pose" if all(truth.image(own) is not None for own in own_of.values()) else "raw"
+    auto = choose(field, scene, source, target, lights=lights)
+    training = learn_training(field, scene, source, target) if auto.training is None else auto.training
     totals: dict[str, list[dict[str, np.ndarray]]] = {}
-    kind, seconds = "aligned", 0.0
-    used = chosen_method("auto", field.sensors[source], field.sensors[target])
+    sensor, seconds = field.sensors[target], 0.0
+    weights: dict[str, float] = {}
     judged: list[int] = []
     for done, frame in enumerate(frames, 1):
         raw, _ = load_frame(field.sensors[source], frame)
-        own = None if aligned else next(iter(scene.frames_of(target, (frame.view,))), None)
+        own = None if aligned else own_of.get(frame.view)
         if not aligned and own is None:
             continue
         seen_by = None if own is None else PosedCamera(own.camera, field.pose_of(own))
         view = PosedCamera(frame.camera, field.pose_of(frame))
-        light, region, kind = _truth_of(truth, field.sensors[target], frame, own)
-        results: dict[str, np.ndarray] = {}
-        for method in METHODS[1:]:
-            began = time.perf_counter()
-            found = convert_frame(field, raw, view, source=source, target=target, method=method, seen_by=seen_by)
-            seconds += (time.perf_counter() - began) * (method == used)
-            results[method] = _values(found, field.sensors[target])
-        results["linear"] = _by_linear(field, raw, view, source, matrix, seen_by, results["field"])
-        results["nearest"] = _by_nearest(field, scene, target, seen_by or view, results["field"])
+        light, region = _truth_of(truth, sensor, frame, own, kind)
+        began = time.perf_counter()
+        found = convert_frame(field, raw, view, source=source, target=target, method=auto, seen_by=seen_by, left_out=frame.view)
+        seconds += time.perf_counter() - began
+        for taken, weight in found.weights.items():
+            weights[taken] = weights.get(taken, 0.0) + weight
+        results: dict[str, np.ndarray] = {"auto": _values(found, sensor)}
+        compared = compare(field, raw, view, source, target)
+        said = predict(field, compared, source, target, PREDICTIONS, training=training, seen_by=seen_by, left_out=frame.view)
+        results |= {m: _values(blended(sensor, m, compared, said, {m: 1.0}), sensor) for m in PREDICTIONS}
         for name, values in results.items():
-            totals.setdefault(name, []).append(_errors(values, light, found.valid, region, field.sensors[target], kind))
+            totals.setdefault(name, []).append(_errors(values, light, found.valid, region, sensor, kind))
         judged.append(frame.view)
         if progress is not None:
             progress(done, len(frames))
@@ -110,76 +120,25 @@ def evaluate_conversion(
         "target": target,
         "truth": kind,
         "views": judged,
-        "auto": used,
+        "auto": {name: weight / len(judged) for name, weight in weights.items()},
+        "evidence": None if auto.evidence is None else auto.evidence.facts(),
         "methods": {name: _summary(rows) for name, rows in totals.items()},
         "seconds_per_frame": seconds / len(judged),
     }
 
 
-def _truth_of(truth: GroundTruth, target: Sensor, frame: Frame, own: Frame | None) -> tuple[np.ndarray, np.ndarray | None, str]:
-    """Light (H, W, C), of polarization Stokes, or raw photosites; the region; what it is."""
+def _truth_of(truth: GroundTruth, target: Sensor, frame: Frame, own: Frame | None, kind: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Light (H, W, C), of polarization Stokes, or raw photosites; the region."""
     if own is None:
         shape = truth.geometry(frame.view) or {}
         region = shape["in_roi"].astype(bool) if "in_roi" in shape else truth.region(frame)
-        return truth.aligned(frame.view)[target.name].astype(np.float64), region, "aligned"
-    light = truth.image(own)
-    if light is not None:
-        return light.astype(np.float64), truth.region(own), "own pose"
-    return load_frame(target, own)[0].astype(np.float64), truth.region(own), "raw"
+        return truth.aligned(frame.view)[target.name].astype(np.float64), region
+    light = truth.image(own) if kind == "own pose" else None
+    return (load_frame(target, own)[0] if light is None else light).astype(np.float64), truth.region(own)
 
 
 def _values(found: Converted, target: Sensor) -> np.ndarray:
     return (found.stokes if target.is_polarization and found.stokes is not None else found.values).astype(np.float64)
-
-
-def _as_light(values: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Intensities → Stokes vectors, where the sensor is one for polarization."""
-    if sensor.polarizer_angles_deg is None:
-        return values
-    return intensities_to_stokes(torch.from_numpy(np.asarray(values, np.float64)), sensor.polarizer_angles_deg).numpy()
-
-
-def _linear(field: Field, scene: Scene, source: str, target: str) -> np.ndarray:
-    """(C + 1, K): least squares from the source's channels and 1 to the target's, in renderings of training poses."""
-    frames = scene.frames_of(source, scene.split.train)
-    chosen = frames[:: max(1, len(frames) // _LEARNED_FROM)]
-    xs, ys = [], []
-    for frame in chosen:
-        seen = field.render(frame.camera, field.pose_of(frame), list(dict.fromkeys((source, target))), geometry=False)
-        x = seen.channels[source][seen.valid].astype(np.float64)
-        xs.append(np.concatenate([x, np.ones((len(x), 1))], 1))
-        ys.append(_as_light(seen.channels[target][seen.valid].astype(np.float64), field.sensors[target]))
-    x, y = np.concatenate(xs), np.concatenate(ys)
-    return np.linalg.solve(x.T @ x + 1e-6 * len(x) * np.eye(x.shape[1]), x.T @ y)
-
-
-def _by_linear(
-    field: Field,
-    raw: np.ndarray,
-    view: PosedCamera,
-    source: str,
-    matrix: np.ndarray,
-    seen_by: PosedCamera | None,
-    otherwise: np.ndarray,
-) -> np.ndarray:
-    channels = channels_of(raw, field.sensors[source].mosaic).astype(np.float64)
-    values = np.concatenate([channels, np.ones((*channels.shape[:2], 1))], -1) @ matrix
-    if seen_by is None:
-        return np.asarray(values)
-    carried, visible = warp_through_surface(field, values, view, seen_by)
-    return np.where(visible[..., None], carried, otherwise)
-
-
-def _by_nearest(field: Field, scene: Scene, target: str, seen_by: PosedCamera, otherwise: np.ndarray) -> np.ndarray:
-    """The training frame whose camera stands nearest, carried over."""
-    centre = seen_by.camera_to_world[:3, 3]
-    frames = scene.frames_of(target, scene.split.train)
-    if not frames:
-        return otherwise
-    nearest = min(frames, key=lambda f: float(np.linalg.norm(field.pose_of(f)[:3, 3] - centre)))
-    values = _as_light(channels_of(load_frame(field.sensors[target], nearest)[0], field.sensors[target].mosaic), field.sensors[target])
-    carried, visible = warp_through_surface(field, values, PosedCamera(nearest.camera, field.pose_of(nearest)), seen_by)
-    return np.where(visible[..., None], carried, otherwise)
 
 
 def _errors(

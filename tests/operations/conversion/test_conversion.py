@@ -15,7 +15,7 @@ import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.guidance import guide, linear_map
-from mmsynth.operations.conversion.methods import Converted, chosen_method, convert_frame
+from mmsynth.operations.conversion.methods import Converted, choose, convert_frame
 from mmsynth.scene.scene import PosedCamera, Sensor
 from mmsynth.sensors.camera import Camera
 from mmsynth.sensors.mosaic import mosaic
@@ -181,11 +181,15 @@ def test_the_gain_is_the_weighted_mean_that_it_should_be() -> None:
 
 
 def test_methods_by_name() -> None:
-    assert chosen_method("auto", RGB, MS) == "guided" and chosen_method("auto", MONO, MS) == "ratio"
-    assert chosen_method("auto", RGB, POL) == "ratio" and chosen_method("auto", POL, RGB) == "ratio"
-    assert chosen_method("field", RGB, MS) == "field"
-    with pytest.raises(InputError, match="method is 'magic', expected one of auto, field, ratio, guided"):
-        chosen_method("magic", RGB, MS)
+    """Without a scene auto goes by the kind of the modalities; what needs the scene says so."""
+    field: Any = AnalyticField(sphere())
+    kinds = {("rgb", "ms"): "guided", ("mono", "ms"): "ratio", ("rgb", "pol"): "ratio", ("pol", "rgb"): "ratio"}
+    assert {pair: choose(field, None, *pair).method for pair in kinds} == kinds
+    assert choose(field, None, "rgb", "ms", "field").method == "field"
+    with pytest.raises(InputError, match="method is 'magic', expected one of auto, field, ratio, guided, linear, nearest"):
+        choose(field, None, "rgb", "ms", "magic")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="method 'nearest' needs the scene's training frames"):
+        choose(field, None, "rgb", "ms", "nearest")
     with pytest.raises(InputError, match=r"a frame of shape \(3, 4\), expected \(72, 96\) of rgb"):
         converted(RGB, "ms", raw=np.zeros((3, 4)))
 
@@ -196,7 +200,8 @@ def test_files_of_a_target_at_its_own_place(tmp_path: Path) -> None:
     convert_files(field, scene, tmp_path / "out", source="rgb", target="ms", frames=[1], as_sensor=True)
     sidecar = json.loads((tmp_path / "out/ms/0001.json").read_text())
     np.testing.assert_allclose(sidecar["camera"]["camera_to_world"], scene.frames_of("ms")[1].camera_to_world, atol=1e-12)
-    assert sidecar["method"] == "guided" and 0 < sidecar["guided"] <= 1
+    assert sidecar["method"] == "auto" and sum(sidecar["weights"].values()) == pytest.approx(1.0)
+    assert sidecar["evidence"]["views"] == [0] and "field" in sidecar["evidence"]["psnr"] and 0 <= sidecar["guided"] <= 1
     with np.load(tmp_path / "out/ms/0001.npz") as arrays:
         expected = mosaic(torch.from_numpy(arrays["data"]).movedim(-1, 0), MS.mosaic).numpy()  # type: ignore[arg-type]
         np.testing.assert_array_equal(arrays["raw"], expected)

@@ -108,7 +108,7 @@ def test_at_given_poses(tmp_path: Path, file_format: Any) -> None:
     convert_files(field, scene, tmp_path / "seen", images=[tmp_path / "shot1.png"], as_sensor=True, **to_ms)
     assert [p.stem for p in (tmp_path / "seen/ms").glob("*.json")] == ["shot1"]
     facts = json.loads((tmp_path / "seen/ms/shot1.json").read_text())
-    assert facts["method"] == "guided" and facts["frame_exposure"] == pytest.approx(0.5, rel=1e-3)
+    assert facts["method"] == "auto" and facts["weights"]["field"] == 1.0 and facts["frame_exposure"] == pytest.approx(0.5, rel=1e-3)
     np.testing.assert_allclose(facts["camera"]["camera_to_world"], ring_pose(1, 9) @ field.rig["ms"], atol=1e-12)
 
 
