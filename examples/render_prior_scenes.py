@@ -18,7 +18,7 @@ One unit for all modalities and scenes:
 
 with radiance 1, on average over 400 to 700 nm, for a perfect white that lies flat in the middle of the empty table under the lamps alone
 (what walls and things add or hide is in the truth, not in that number).
-`exposure.json` has the gains, `sensors.json` also responses, the light on that white, its value in each channel, and the lamps.
+`exposure.json` has the gains and that white in each channel, `sensors.json` also responses, the light on that white, and the lamps.
 
 How: truth is traced at a comb of 16 wavelengths, shifted at random from sample to sample, and all channels are sums over the same paths. So
 the noise of channels goes together, and their ratios have less of it.
@@ -616,8 +616,10 @@ def render_scene(
     calibration = {s.name: {"sensor": s.title, **example.lens(s), "camera2reference": example.rounded(s.to_reference)} for s in sensors}
     example.write_json(out / "meta_data.json", meta)
     example.write_json(out / "calibration.json", calibration)
-    example.write_json(out / "exposure.json", gains)
-    example.write_json(out / "sensors.json", describe(made, sensors, gains, noise))
+    described = describe(made, sensors, gains, noise)
+    whites = {name: of["white"] for name, of in described["sensors"].items()}
+    example.write_json(out / "exposure.json", {**gains, "white": whites})
+    example.write_json(out / "sensors.json", described)
     example.write_json(out / "gt/labels.json", {str(i): name for i, name in enumerate(made.labels())})
     for view, pose in enumerate(poses):
         aligned = {s.name: (gains[s.name] * truth[s.name][view]).astype(np.float16) for s in sensors}

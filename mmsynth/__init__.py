@@ -5,6 +5,7 @@ What a command does is one call:
 * ``mmsynth calibrate``: ``calibrate_rig`` → ``Calibration``: a rig from frames of boards, with its files.
 * ``mmsynth info``: ``load_scene`` → ``Scene``: sensors, frames with cameras and poses, split, problems.
 * ``mmsynth fit``: ``fit_run`` → ``Run``: a fit with its report and ``runs/latest``. ``fit``: the field alone.
+* ``mmsynth prior``: ``make_prior``; ``find_prior`` reads one, for ``fit_run(..., prior=...)``.
 * ``mmsynth evaluate``: ``evaluate_run(open_run())``, ``evaluate_conversions``. ``evaluate``: the scores alone.
 * ``mmsynth convert``: ``convert_files``. ``convert``: tensors in, tensors out.
 * ``mmsynth generate-dataset``: ``generate_dataset``, ``verify_dataset``. ``AlignedDataset`` reads one for training.
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from mmsynth.workflows.calibrate import calibrate_rig
     from mmsynth.workflows.fit import evaluate_run, fit_run
     from mmsynth.workflows.pose import pose_scene
+    from mmsynth.workflows.prior import find_prior, make_prior
     from mmsynth.workflows.runs import Run, open_run
 
 _NAMES = {
@@ -80,6 +82,7 @@ _NAMES = {
     "workflows.calibrate": "calibrate_rig",
     "workflows.fit": "evaluate_run fit_run",
     "workflows.pose": "pose_scene",
+    "workflows.prior": "find_prior make_prior",
     "workflows.runs": "Run open_run",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
@@ -87,7 +90,8 @@ _HOMES = {name: module for module, names in _NAMES.items() for name in names.spl
 __all__ = [
     "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise",
     "calibrate_rig", "convert", "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "export_scene", "extract_mesh",
-    "fit", "fit_run", "generate_dataset", "load_recipe", "load_scene", "mesh_to_file", "open_run", "pose_scene", "run_batch", "simulate",
+    "find_prior", "fit", "fit_run", "generate_dataset", "load_recipe", "load_scene", "make_prior",
+    "mesh_to_file", "open_run", "pose_scene", "run_batch", "simulate",
     "verify_dataset", "write_mesh",
 ]  # fmt: skip
 

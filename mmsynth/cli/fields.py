@@ -74,6 +74,10 @@ def fit(
     exposure: Annotated[
         Path | None, typer.Option(help="gains or white boards of the modalities, for --prior; default: exposure.json in the scene")
     ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="file of one of the scene's sensors that --prior does not know, for its responses; once for each"),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
@@ -92,7 +96,6 @@ def fit(
     from mmsynth.workflows.prior import find_prior
 
     seconds = fit_length(steps, budget)
-    of_scenes = None if prior is None else find_prior(prior)
     stated = None if exposure is None else read_exposure(exposure)
     meaning, folder = masks_of(masks)
     read = load_scene(
@@ -100,6 +103,7 @@ def fit(
         masks=meaning, mask_folder=folder,
     )  # fmt: skip
     loaded = keep_frames(read, frame_limits(frames))
+    of_scenes = None if prior is None else find_prior(prior, loaded, sensor or ())
     say = (lambda text: None) if as_json else print
     for problem in loaded.problems:
         say(f"note: {problem}")
@@ -199,6 +203,10 @@ def prior(
     budget: Annotated[str | None, typer.Option(help="time of the fit of each scene, e.g. 60s, 5m; default 60s")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="or its optimiser steps")] = None,
     truth: Annotated[bool, typer.Option("--truth", help="do not fit scenes: take the aligned truth in their gt folders")] = False,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="file of one of the sensors, for its responses: other rigs can use the prior then; once for each"),
+    ] = None,
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     as_json: JsonOption = False,
@@ -217,6 +225,7 @@ def prior(
         seed=seed,
         device=pick_device(device),
         truth=truth,
+        sensors=sensor or (),
         say=(lambda text: None) if as_json else print,
     )
     if as_json:

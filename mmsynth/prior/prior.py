@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from mmsynth.prior.samples import SceneSamples, columns_of
 from mmsynth.prior.spectra import Spectra, learn_spectra, white_of
 from mmsynth.scene.scene import Sensor
 from mmsynth.scene.serialisation import channels_to_json, sensor_from_json, sensor_to_json
+from mmsynth.sensors.sensor_file import Response
 from mmsynth.version import __version__
 
 FORMAT = 1
@@ -33,12 +34,14 @@ class Prior:
     Attributes:
         sensors: the modalities it knows, by name. spectra: of all their channels.
         polarization: None where no scene had a polarization sensor. scenes: names of those it was learned from.
+        responses: of its channels over wavelength, by modality, as far as sensor files were given; of polarization of S0 alone.
     """
 
     sensors: dict[str, Sensor]
     spectra: Spectra
     polarization: Polarization | None
     scenes: tuple[str, ...]
+    responses: dict[str, tuple[Response | None, ...]] = field(default_factory=dict)
 
     @property
     def colour(self) -> np.ndarray:
@@ -128,6 +131,9 @@ def save_prior(prior: Prior, path: Path) -> None:
         "mmsynth": __version__,
         "sensors": [sensor_to_json(sensor) for sensor in prior.sensors.values()],
         "scenes": list(prior.scenes),
+        "responses": {
+            name: [None if r is None else r.model_dump(exclude_defaults=True) for r in of] for name, of in prior.responses.items()
+        },
     }
     content = save(tensors, {"prior": json.dumps(about)})
     write_atomic(path, lambda temporary: temporary.write_bytes(content))
@@ -152,6 +158,7 @@ def load_prior(path: Path) -> Prior:
             Spectra(**arrays, scenes=len(about["scenes"])),
             None if weights is None else Polarization(tensors["polarization.centre"], tensors["polarization.scale"], weights),
             tuple(about["scenes"]),
+            {name: tuple(None if r is None else Response(**r) for r in of) for name, of in about["responses"].items()},
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a prior of mmsynth ({error}).") from error

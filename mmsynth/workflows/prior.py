@@ -10,8 +10,11 @@ from mmsynth.field.samples import sample_field
 from mmsynth.fitting.run import fit
 from mmsynth.packaged import data_folder
 from mmsynth.prior.prior import Prior, learn_prior, load_prior, save_prior
+from mmsynth.prior.responses import for_sensors, with_responses
 from mmsynth.scene.exposure import stated_exposure
 from mmsynth.scene.load import load_scene
+from mmsynth.scene.scene import Scene
+from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
 from mmsynth.workflows.runs import Run, is_run, open_run
 from mmsynth.workflows.truth_samples import sample_truth
 
@@ -25,6 +28,7 @@ def make_prior(
     seed: int = 0,
     device: str = "cpu",
     truth: bool = False,
+    sensors: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Prior:
     """Learn a prior from runs, and from scenes, which are fitted first, and write it.
@@ -33,7 +37,8 @@ def make_prior(
         sources: run folders or scenes, each with several modalities. budget, steps, device: of the fits of scenes, see ``fit``; their
             runs are
             in ``OUT's folder/prior_runs/SCENE`` and are taken again where they are finished. truth: do not fit scenes, take
-            their ``gt/aligned`` and ``gt/geometry``: a second each, but nothing is known of gloss. say: told one line a source.
+            their ``gt/aligned`` and ``gt/geometry``: a second each, but nothing is known of gloss. sensors: files of captured sensors, or
+            names of packaged ones, that say what the modalities' responses are. say: told one line a source.
     Raises:
         InputError: no sources, one that is neither run nor scene or has one modality, or the file cannot be written.
     """
@@ -49,7 +54,7 @@ def make_prior(
         frames = run.scene.frames_of(run.field.measured[0], run.scene.split.train)
         samples.append(sample_field(run.field, frames, run.scene.root.resolve().name, stated_exposure(run.scene), seed=seed))
         say(f"{run.folder}: {len(samples[-1].images):,} rays of {', '.join(run.field.measured)}")
-    prior = learn_prior(samples, seed)
+    prior = with_responses(learn_prior(samples, seed), [load_sensor(find_sensor_file(name)) for name in sensors])
     save_prior(prior, out)
     return prior
 
@@ -67,11 +72,15 @@ def _run_of(source: Path, folder: Path, budget: float | None, steps: int | None,
     return Run(run, fit(scene, run, budget=budget, steps=steps, seed=seed, device=device), scene)
 
 
-def find_prior(name: str) -> Prior:
+def find_prior(name: str, scene: Scene | None = None, sensors: Sequence[str] = ()) -> Prior:
     """A prior by its file, or a packaged one by its name.
 
+    Args:
+        scene: for whose sensors; those of which there are ``sensors``, files of captured sensors, are expressed by the prior's channels.
     Raises:
-        InputError: there is none.
+        InputError: there is none, or it does not see the wavelengths of one of the scene's sensors.
     """
     packaged = data_folder("recipes") / "priors" / f"{name}.safetensors"
-    return load_prior(packaged if Path(name).suffix == "" and packaged.is_file() else Path(name))
+    prior = load_prior(packaged if Path(name).suffix == "" and packaged.is_file() else Path(name))
+    files = [load_sensor(find_sensor_file(file)) for file in sensors]
+    return prior if scene is None or not files else for_sensors(prior, scene.sensors, files)
