@@ -10,6 +10,7 @@
     frames = { scored = 3 }              # training frames, a number or a share of them; left out: all
     rays = 0.5                           # share of the rays of a step
     input = "demosaicked"                # and undistorted; left out: raw frames
+    prior = true                         # tells what is not fitted; such rows are for those who give one
 
 A table has a column for each modality. ``scored`` is the modality of the column, so that such a row asks for a fit for each; ``all`` are
 all modalities of the scene; ``each``, which is for names, too (``{each}``), repeats the row with every modality. In ``frames`` what is said
@@ -49,6 +50,7 @@ class Row(BaseModel):
     frames: dict[str, Count | Share] = {}
     rays: float = Field(1.0, gt=0, le=1)
     input: Input = "raw"
+    prior: bool = False
 
     @model_validator(mode="after")
     def _says_what_it_repeats(self) -> Row:
@@ -98,20 +100,22 @@ class Fit:
 
     Attributes:
         modalities: in the scene's order. frames: modality → training frames, of those that keep fewer than all. rays: share of those of
-            a step.
+            a step. prior: whether one tells what is not fitted.
     """
 
     modalities: tuple[str, ...]
     frames: tuple[tuple[str, int], ...]
     rays: float
     input: Input
+    prior: bool = False
 
     @property
     def name(self) -> str:
         """For names of files, the same for the same fit."""
         frames = dict(self.frames)
         parts = ["+".join(f"{m}{frames.get(m, '')}" for m in self.modalities)]
-        return "-".join([*parts, *([f"rays{self.rays:g}"] if self.rays < 1 else []), *(["demosaicked"] if self.input != "raw" else [])])
+        of_rays = [f"rays{self.rays:g}"] if self.rays < 1 else []
+        return "-".join([*parts, *of_rays, *(["demosaicked"] if self.input != "raw" else []), *(["prior"] if self.prior else [])])
 
     def recipe(self, recipe: Recipe, known: int | None) -> Recipe:
         """The recipe with this fit's rays of a step.
@@ -174,4 +178,4 @@ def fit_of(row: Row, scored: str, scene: Scene) -> Fit | None:
         if count >= available:
             return None
         frames.append((name, count))
-    return Fit(tuple(name for name in known if name in wanted), tuple(frames), row.rays, row.input)
+    return Fit(tuple(name for name in known if name in wanted), tuple(frames), row.rays, row.input, row.prior)

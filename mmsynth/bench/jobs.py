@@ -34,9 +34,9 @@ Input = Literal["raw", "demosaicked"]
 
 _PACKAGE = Path(__file__).parents[1]
 # what a fit and its score run through
-_CODE = ("field", "fitting", "scene", "sensors", "operations/evaluation", "operations/export/demosaicked.py", "bench/worker.py")
+_CODE = ("field", "fitting", "prior", "scene", "sensors", "operations/evaluation", "operations/export/demosaicked.py", "bench/worker.py")
 # of a task, where files are: the identity has what is in them
-_PLACES = ("scene", "mask_folder", "prepared")
+_PLACES = ("scene", "mask_folder", "prepared", "prior")
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class Job:
         steps, budget: length in optimiser steps, or in seconds; one of the two. device: cpu or cuda.
         masks, mask_folder: as for ``load_scene``. input: what is learned from; scored on the frames as they were recorded in any case.
         prepared: folder for copies of scenes that another ``input`` takes. any_machine: a result counts on whatever machine it was made.
+        prior: file that tells the modalities that are not fitted, None: nothing does.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Job:
     input: Input = "raw"
     prepared: str = "prepared"
     any_machine: bool = False
+    prior: str | None = None
 
     def task(self) -> dict[str, Any]:
         """What the child process has to do, ready for JSON."""
@@ -184,6 +186,7 @@ def identity(job: Job, scene: str) -> dict[str, Any]:
     return {
         "scene": scene,
         **task,
+        **({} if job.prior is None else {"prior": _file_hash(Path(job.prior)).hex()[:16]}),
         "code": code_hash(),
         "versions": machine["versions"],
         "machine": {key: machine[key] for key in keys},

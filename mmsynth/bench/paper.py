@@ -88,6 +88,7 @@ def bench_paper(
     device: str = "cpu",
     part: WorkPartition | None = None,
     progress: Progress | None = None,
+    prior: Path | None = None,
 ) -> Report:
     """Fit and score what the tables ask for, and make them.
 
@@ -100,6 +101,7 @@ def bench_paper(
             modality has as many rays a step in a fit of few modalities as in one of all, as the papers have it; with a budget every fit
             has the same time.
         masks, mask_folder: as for ``load_scene``. part: the fits of this process, None: all. progress: called with (fits done, fits).
+        prior: file of rows that have one, None: these are left out.
     Returns:
         ``results`` with ``rows`` (what ``jobs.run_jobs`` gives of every fit, with ``scene`` and ``fit``), ``tables``, ``unfinished``
         and ``failed``: names of fits, and sentences by name; ``notes``: sentences. No files where others are still at work.
@@ -120,11 +122,11 @@ def bench_paper(
             f"{path.resolve().name}-{fit.name}-seed{seed}", str(path), fit.recipe(recipe, known if budget is None else None), chosen,
             dict(fit.frames), seed, steps, budget, device, masks=masks,
             mask_folder=None if mask_folder is None else str(mask_folder), input=fit.input, prepared=str(out / "prepared"),
-            any_machine=True,
+            any_machine=True, prior=str(prior) if fit.prior else None,
         )  # fmt: skip
 
     experiments, read = load_experiments(tables), _read_scenes(scenes, masks, mask_folder)
-    cells = cells_of(experiments, {name: scene for name, (_, scene) in read.items()})
+    cells = cells_of(experiments, {name: scene for name, (_, scene) in read.items()}, priors=prior is not None)
     fits = list(dict.fromkeys((cell.scene, cell.fit) for cell in cells))
     jobs = {(name, fit, seed): job(*read[name], fit, seed) for seed in seeds for name, fit in fits}
     plan = Plan(experiments, {name: scene for name, (_, scene) in read.items()}, cells, jobs)
@@ -152,8 +154,8 @@ def bench_paper(
     return _report(plan, found | {key: row for key, row in others.items() if row is not None}, results, out, only_if_finished=True)
 
 
-def cells_of(experiments: Mapping[str, Experiment], scenes: Mapping[str, Scene]) -> list[Cell]:
-    """Every number that the tables can have on these scenes.
+def cells_of(experiments: Mapping[str, Experiment], scenes: Mapping[str, Scene], priors: bool = False) -> list[Cell]:
+    """Every number that the tables can have on these scenes, ``priors``: those with a prior, too.
 
     Raises:
         InputError: there is none.
@@ -164,6 +166,7 @@ def cells_of(experiments: Mapping[str, Experiment], scenes: Mapping[str, Scene])
         for table, experiment in experiments.items()
         for given in experiment.row
         for row in given.repeated(modalities)
+        if priors or not row.prior
         for modality in modalities
         for name, scene in scenes.items()
         if (fit := fit_of(row, modality, scene)) is not None
@@ -292,7 +295,7 @@ def _note(experiment: Experiment, cells: Sequence[Cell], plan: Plan, found: Rows
         seconds, cores = [row["seconds"] for row in used], sorted({(row["cores"], row["threads"]) for row in used})
         where = " and ".join(f"{c} cores, {t} {'thread' if t == 1 else 'threads'}" for c, t in cores)
         told.append(f"{len(used)} fits of {min(seconds):.0f} to {max(seconds):.0f} s, {sum(seconds):.0f} s in all, on {where}.")
-    rows = [row.name for given in experiment.row for row in given.repeated(plan.modalities)]
+    rows = [row.name for given in experiment.row for row in given.repeated(plan.modalities) if not row.prior]
     absent = [name for name in rows if name not in {cell.row.name for cell in cells}]
     if absent:
         told.append(f"Left out, as no scene has the modalities, frames, mosaics or lenses for them: {'; '.join(absent)}.")

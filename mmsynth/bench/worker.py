@@ -26,6 +26,7 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.work_partition import local_device
+from mmsynth.prior.prior import load_prior
 
 
 def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -44,10 +45,11 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         warm_up()
     if task["input"] != "raw":
         scene_of(task)  # the copy that it takes is made before the clock starts
+    prior = None if task["prior"] is None else load_prior(Path(task["prior"]))
     began, cpu = time.perf_counter(), time.process_time()
     scene = scene_of(task)
     length = {"steps": task["steps"], "budget": task["budget"]}
-    field = fit(scene, folder / "run", recipe=Recipe(**task["recipe"]), **length, seed=task["seed"], device=device)
+    field = fit(scene, folder / "run", recipe=Recipe(**task["recipe"]), **length, seed=task["seed"], device=device, prior=prior)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at, and as it was recorded

@@ -111,6 +111,7 @@ def bench_paper(
     steps: Annotated[int | None, typer.Option(min=1, help="length of every fit in optimiser steps")] = None,
     budget: Annotated[str | None, typer.Option(help="or its time; default 60s")] = None,
     seeds: Annotated[str, typer.Option(help="everything is fitted with each, e.g. 0,1,2")] = "0",
+    prior: Annotated[str | None, typer.Option(help="for rows with a prior: a file of `mmsynth prior`, or default", metavar="FILE")] = None,
     recipe: RecipeOption = None,
     masks: MasksOption = None,
     device: DeviceOption = "cpu",
@@ -122,7 +123,10 @@ def bench_paper(
     from mmsynth.fitting.device import pick_device
     from mmsynth.fitting.recipe import load_recipe
     from mmsynth.operations.output.work_partition import partition_of_environment
+    from mmsynth.workflows.prior import find_prior, prior_file
 
+    if prior is not None:
+        find_prior(prior)  # that it cannot be read is known now and not after the first fits
     chosen = None if tables is None else [name.strip() for name in tables.split(",")]
     meaning, folder = masks_of(masks)
     with progress_bar("bench paper", as_json) as show:
@@ -139,6 +143,7 @@ def bench_paper(
             pick_device(device),
             partition_of_environment(),
             show,
+            None if prior is None else prior_file(prior),
         )
     print_report(report, as_json)
     failed = report.results["failed"]

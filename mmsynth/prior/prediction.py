@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
-from mmsynth.prior.correction import Correction, choose_points, gain_of, learn, places_of
+from mmsynth.prior.correction import Correction, choose_lengths, choose_points, gain_of, learn, places_of
 from mmsynth.prior.polarization import inputs_of
 from mmsynth.prior.prior import Prior, described, lamp_unit
 from mmsynth.prior.samples import SceneSamples, Shapes, columns_of
 from mmsynth.prior.spectra import SpectralMap, White, spectral_map, white_of
+from mmsynth.scene.exposure import Exposure
 from mmsynth.scene.scene import Sensor
 from mmsynth.scene.serialisation import channels_to_json
 from mmsynth.sensors.polarization import stokes_to_intensities
@@ -165,23 +166,26 @@ class Prediction:
         sizes = self.spectra.base[at].sqrt()
         points = choose_points(places)
         angles = self.sensors[name].polarizer_angles_deg
+        left = rest.clone()
         if angles is not None and found.stokes is not None:
             turned = torch.deg2rad(2.0 * torch.tensor(angles))[channel]
             turn = torch.zeros(len(channel), 2) if seen.shapes is None else seen.shapes.turn
             along = turn[:, 0] * torch.cos(turned) + turn[:, 1] * torch.sin(turned)
             parts = 0.5 * torch.stack([level * white[0], found.stokes[:, 0] * along], 1)
-            weights, unknown, left = learn(points, places, parts, torch.cat([sizes, sizes.new_tensor([_UNSURE_Q])]), rest)
+            groups = [torch.arange(len(channel))]
+            of_channels = [(places, parts, torch.cat([sizes, sizes.new_tensor([_UNSURE_Q])]), rest)]
         else:
-            of_channels = []
-            left = rest.clone()
-            for c in range(len(white)):
-                rows = channel == c
-                part = (level[rows] * white[c])[:, None]
-                *learned, left[rows] = learn(points, places[rows], part, sizes[c : c + 1], rest[rows])
-                of_channels.append(learned)
-            weights, unknown = (torch.cat(parts) for parts in zip(*of_channels, strict=True))
+            groups = [torch.nonzero(channel == c)[:, 0] for c in range(len(white))]
+            each = zip(groups, white, sizes, strict=True)
+            of_channels = [(places[rows], (level[rows] * w)[:, None], size[None], rest[rows]) for rows, w, size in each]
+        lengths = choose_lengths(points, of_channels)
+        learned = []
+        for rows, of_channel in zip(groups, of_channels, strict=True):
+            *tensors, left[rows] = learn(points, of_channel, lengths)
+            learned.append(tensors)
+        weights, unknown = (torch.cat(parts) for parts in zip(*learned, strict=True))
         rms = lambda values: float(values.square().mean().sqrt())
-        made = Correction(gain, points, weights, unknown, frames, rms(measured - predicted), rms(left))
+        made = Correction(gain, points, weights, unknown, lengths, frames, rms(measured - predicted), rms(left))
         return replace(self, corrections={**self.corrections, name: made})
 
 
@@ -215,7 +219,7 @@ def scene_facts(prior: Prior, sample: SceneSamples, error: Mapping[str, float]) 
     """
     known = common(prior, sample.sensors)
     columns = columns_of(prior.sensors)
-    white = white_of(prior.spectra, columns, known, sample)
+    white = white_of(prior.spectra, columns, known, sample, _lit(prior, sample.exposure))
     kept = {name: sample.body[name] for name in known}
     reflected = [light / np.exp(white.log[columns[name]]) for name, light in kept.items()]
     level = float(np.concatenate(reflected, 1).mean())
@@ -233,6 +237,22 @@ def scene_facts(prior: Prior, sample: SceneSamples, error: Mapping[str, float]) 
         lamp=lamp_unit(only, columns, white.log),
         error=tuple(errors),
     )
+
+
+def _lit(prior: Prior, exposure: Exposure) -> np.ndarray | None:
+    """``lit`` of ``white_of``: the stated lamp through the responses of the prior's channels; of a dark channel nothing."""
+    if exposure.lamp is None:
+        return None
+    columns = columns_of(prior.sensors)
+    out = np.full(prior.spectra.usual.shape[1], np.nan)
+    for name, responses in prior.responses.items():
+        for i, response in zip(range(columns[name].start, columns[name].stop), responses, strict=True):
+            if response is not None:
+                step = min(1.0, response.detail_nm() / 4.0)
+                nm = np.arange(*response.range_nm(), step)
+                light = float((response.at(nm) * exposure.lamp.at(nm)).sum() * step)
+                out[i] = np.log(light) if light > 0 else np.nan
+    return out
 
 
 def common(prior: Prior, sensors: Mapping[str, Sensor]) -> list[str]:

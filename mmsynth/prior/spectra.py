@@ -1,9 +1,9 @@
 """Light in some channels from light in others: what scenes have in common of spectra.
 
 Everything is said of *reflected* light r: a body's light over what a white board would show there in that channel (its gain and the lamps'
-spectrum are then gone), up to one factor for a scene. White is known from a board, from the lamps that surfaces mirror, or else taken as
-grey-world methods do, from the mean colour (``usual``). Whites of scenes whose gains are stated lie near a line in log space, as those of
-black bodies do, log w = a + b t + one factor: known channels give t, and t the others.
+spectrum are then gone), up to one factor for a scene. White is known from a board, from the lamps' stated spectrum, from the lamps that
+surfaces mirror, or else taken as grey-world methods do, from the mean colour (``usual``). Whites of scenes whose gains are stated lie near
+a line in log space, as those of black bodies do, log w = a + b t + one factor: known channels give t, and t the others.
 
 Of r are kept: second moments over scenes, which give the linear map of least squares (homogeneous: invariant to exposure); and per scene
 clusters by chromaticity in all channels, with mean and variance, which say where the linear map errs and how surely. From chromaticities
@@ -119,45 +119,66 @@ def learn_spectra(sensors: Mapping[str, Sensor], scenes: Sequence[SceneSamples],
     )
 
 
-def white_of(spectra: Spectra, columns: Mapping[str, slice], known: Sequence[str], scene: SceneSamples) -> White:
-    """White of a scene in all channels, from what is stated, from its lamps, or from its mean colour in the ``known`` modalities."""
+def white_of(
+    spectra: Spectra, columns: Mapping[str, slice], known: Sequence[str], scene: SceneSamples, lit: np.ndarray | None = None
+) -> White:
+    """White of a scene in all channels, from what is stated, from its lamps, or from its mean colour in the ``known`` modalities.
+
+    Args:
+        lit: (C,) log of what a white board shows under the stated lamp at a gain of 1, up to one number; NaN where that is not known.
+    """
     count = spectra.usual.shape[1]
     given = np.concatenate([np.arange(count)[columns[name]] for name in known])
     boards = _joined_logs(columns, scene.exposure.white, count)
     noise = np.maximum(spectra.line[2], _LAMP_ERROR)
+    lit = np.full(count, np.nan) if lit is None else lit
     if np.isfinite(boards[given]).all():
         log, how = boards, "a white board"
+    elif np.isfinite(lit[given]).all():
+        log, how = _log_mean(_joined(columns, scene.body, count)), "the stated lamp"
+        for name in known:  # of the mean only the level, which the gain may not say
+            of = np.arange(count)[columns[name]]
+            log[of] = lit[of] + (log - lit)[of].mean()
     elif scene.lamp is not None:
         log, how = _joined_logs(columns, scene.lamp, count), "the lamps that surfaces mirror"
     else:
         log, how = _log_mean(_joined(columns, scene.body, count)) - spectra.usual[0], "the mean colour"
         noise = np.hypot(noise, spectra.usual[1])
     log = log - log[given].mean()
-    # the colour of known channels gives the place on the line, whatever their gains
-    a, b, off = spectra.line
-    on_line = np.isfinite(a)
-    square = product = 0.0
-    for name in known:
-        of = np.arange(count)[columns[name]]
-        if on_line[of].all():
-            slope, rest = b[of] - b[of].mean(), (log - a)[of] - (log - a)[of].mean()
-            square += float((slope**2 / noise[of] ** 2).sum())
-            product += float((slope * rest / noise[of] ** 2).sum())
-    gains = _log_gains(columns, scene, count)
-    line = a + b * product / (square + 1.0) + gains
+    lamp, of_lamp = _on_line(spectra, columns, known, log, noise)
+    if np.isfinite(lit).any():  # said, and not only what lamps are like
+        both = np.isfinite(lit + lamp)
+        lamp = np.where(np.isfinite(lit), lit + float((lamp - lit)[both].mean() if both.any() else 0.0), lamp)
+        of_lamp = np.where(np.isfinite(lit), _LAMP_ERROR, of_lamp)
+    line = lamp + _log_gains(columns, scene, count)
     anchors = given[np.isfinite(line[given])]
     level = float((log - line)[anchors].mean()) if len(anchors) else np.nan
     if how == "the mean colour":  # of a few things it says less than what lamps are like
         for name in known:
             of = np.arange(count)[columns[name]]
-            if on_line[of].all():
-                on = (a + b * product / (square + 1.0))[of]
-                log[of] = on - on.mean() + log[of].mean()
+            if np.isfinite(lamp[of]).all():
+                log[of] = lamp[of] - lamp[of].mean() + log[of].mean()
     free = ~np.isfinite(line + level)
     expected = np.where(free, spectra.raw[0] + float((log - spectra.raw[0])[given].mean()), line + level)
-    deviation = np.where(free, spectra.raw[1], np.sqrt(off**2 + b**2 / (square + 1.0)))
+    deviation = np.where(free, spectra.raw[1], of_lamp)
     measured = np.isin(np.arange(count), given) | (np.isfinite(boards) & (how == "a white board"))
     return White(np.where(measured, log, expected), np.where(measured, 0.0, deviation), free & ~measured, how)
+
+
+def _on_line(
+    spectra: Spectra, columns: Mapping[str, slice], known: Sequence[str], log: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log white over gain (C,), NaN where the line is not known, and its deviation: where on the line the colours within the ``known``
+    modalities lie, whatever their gains."""
+    a, b, off = spectra.line
+    square = product = 0.0
+    for name in known:
+        of = np.arange(len(a))[columns[name]]
+        if np.isfinite(a[of]).all():
+            slope, rest = b[of] - b[of].mean(), (log - a)[of] - (log - a)[of].mean()
+            square += float((slope**2 / noise[of] ** 2).sum())
+            product += float((slope * rest / noise[of] ** 2).sum())
+    return a + b * product / (square + 1.0), np.sqrt(off**2 + b**2 / (square + 1.0))
 
 
 @dataclass(frozen=True)

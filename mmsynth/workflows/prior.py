@@ -72,6 +72,12 @@ def _run_of(source: Path, folder: Path, budget: float | None, steps: int | None,
     return Run(run, fit(scene, run, budget=budget, steps=steps, seed=seed, device=device), scene)
 
 
+def prior_file(name: str) -> Path:
+    """Where a prior is that a user named: a file, or a packaged one."""
+    packaged = data_folder("recipes") / "priors" / f"{name}.safetensors"
+    return packaged if Path(name).suffix == "" and packaged.is_file() else Path(name)
+
+
 def find_prior(name: str, scene: Scene | None = None, sensors: Sequence[str] = ()) -> Prior:
     """A prior by its file, or a packaged one by its name.
 
@@ -80,7 +86,6 @@ def find_prior(name: str, scene: Scene | None = None, sensors: Sequence[str] = (
     Raises:
         InputError: there is none, or it does not see the wavelengths of one of the scene's sensors.
     """
-    packaged = data_folder("recipes") / "priors" / f"{name}.safetensors"
-    prior = load_prior(packaged if Path(name).suffix == "" and packaged.is_file() else Path(name))
+    prior = load_prior(prior_file(name))
     files = [load_sensor(find_sensor_file(file)) for file in sensors]
     return prior if scene is None or not files else for_sensors(prior, scene.sensors, files)

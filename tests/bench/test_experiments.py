@@ -81,6 +81,12 @@ def test_few_frames_are_those_that_a_scene_can_spare(scene: Scene) -> None:
     assert fits("rgb-only", scene)["rgb only"] == dict.fromkeys(FIVE, Fit(("rgb",), (), 1.0, "raw"))
 
 
+def test_rows_with_a_prior_are_those_without_it(scene: Scene) -> None:
+    rows = fits("few-frames", scene) | fits("rgb-only", scene)
+    for name in ("rgb only", "rgb + 1 frame", "rgb + 10 frames"):
+        assert rows[f"{name}, prior"] == {m: replace(fit, prior=True) for m, fit in rows[name].items()}
+
+
 def test_a_scene_without_the_modality_has_no_such_fit(scene: Scene) -> None:
     without = replace(scene, sensors={name: sensor for name, sensor in scene.sensors.items() if name != "rgb"})
     rows = fits("few-frames", without)
@@ -105,6 +111,7 @@ def test_names_of_fits_tell_them_apart() -> None:
         Fit(("rgb", "ms"), (("rgb", 3),), 1.0, "raw"),
         Fit(("rgb", "ms"), (), 0.5, "raw"),
         Fit(("rgb", "ms"), (), 1.0, "demosaicked"),
+        Fit(("rgb", "ms"), (), 1.0, "raw", prior=True),
     ]
     assert len({fit.name for fit in different}) == len(different)
 

@@ -159,6 +159,22 @@ def test_a_modality_that_the_field_does_not_know_has_no_score(fits: list[Job], t
         assert set(found["rgb only"]["modalities"]) == {"rgb"} and set(found["together"]["modalities"]) == set(FIVE)
 
 
+def test_a_prior_is_for_rows_that_ask_for_one(fits: list[Job], tmp_path: Path) -> None:
+    file = tmp_path / "prior.safetensors"
+    file.write_bytes(b"one")
+    report = bench_paper([EXAMPLE], tmp_path / "out", Recipe(), ["rgb-only"], steps=3, prior=file)
+    assert {(job.name, job.prior) for job in fits} == {
+        (f"{EXAMPLE.name}-rgb-seed0", None),
+        (f"{EXAMPLE.name}-rgb-prior-seed0", str(file)),
+        (f"{EXAMPLE.name}-rgb+nir+mono+pol+ms-seed0", None),
+    }
+    assert "rgb only, prior" in lines(report, "rgb-only")
+    # another prior of that name is another fit, and the rest stay as they are
+    file.write_bytes(b"two")
+    bench_paper([EXAMPLE], tmp_path / "out", Recipe(), ["rgb-only"], steps=3, prior=file)
+    assert len(fits) == 4 and fits[-1].prior == str(file)
+
+
 def test_masks_are_learned_and_scored_with_and_part_of_a_result(
     fits: list[Job], write_mmsdata: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from painted_rooms import NM, RGB, SENSORS, black_body, light_of, paints, room
+from painted_rooms import NM, RESPONSES, RGB, SENSORS, black_body, light_of, paints, room
 
 from mmsynth.errors import InputError
 from mmsynth.prior.prediction import Seen, predict, scene_facts
@@ -82,3 +82,30 @@ def test_files_that_do_not_fit_are_refused(prior: Prior) -> None:
         with_responses(prior, [OTHER_FILE])
     with pytest.raises(InputError, match="made without sensor files"):
         for_sensors(replace(prior, responses={}), {"rgb": OTHER}, [OTHER_FILE])
+
+
+def stated_lamp(kelvin: float) -> Response:
+    """The rooms have no light beyond NM."""
+    return Response.model_validate({"nm": NM.tolist(), "value": black_body(kelvin).tolist()})
+
+
+def test_a_stated_lamp_is_the_white_of_channels_with_responses(prior: Prior) -> None:
+    # a lamp far off those of the prior's scenes, in a room where nothing mirrors it and all things are of one colour
+    kelvin, gains = 9000.0, {"rgb": 0.03, "nir": 0.02, "ms": 0.05, "pol": 0.01}
+    scene = room(5, kelvin, names=("rgb",), gains=gains, lamp=False, reflectance=paints(1, 3))
+    expected = np.log(np.concatenate([gains[n] * (RESPONSES[n] @ black_body(kelvin)) for n in ("rgb", "nir", "ms")]))
+    lit = replace(scene, exposure=Exposure({n: gains[n] for n in ("rgb", "nir", "ms")}, lamp=stated_lamp(kelvin)))
+    facts = scene_facts(prior, lit, {"rgb": 0.001})
+    assert facts.how == "the stated lamp" and not facts.free
+    found = np.array(facts.white)
+    np.testing.assert_allclose(found - found.mean(), expected - expected.mean(), atol=0.01)
+    without = np.array(scene_facts(prior, replace(lit, exposure=replace(lit.exposure, lamp=None)), {"rgb": 0.001}).white)
+    assert np.abs(without - without.mean() - expected + expected.mean()).max() > 0.1
+
+
+def test_without_gains_a_lamp_says_colours_and_no_levels(prior: Prior) -> None:
+    scene = replace(room(5, 3000.0, names=("rgb",), lamp=False), exposure=Exposure(lamp=stated_lamp(3000.0)))
+    facts = scene_facts(prior, scene, {"rgb": 0.001})
+    expected = np.log(RESPONSES["rgb"] @ black_body(3000.0))
+    np.testing.assert_allclose(np.diff(facts.white[:3]), np.diff(expected), atol=0.01)
+    assert set(facts.free) == {"nir", "ms"} and min(facts.white_deviation[3:]) > 0.05
