@@ -6,6 +6,7 @@ What a command does is one call:
 * ``mmsynth info``: ``load_scene`` → ``Scene``: sensors, frames with cameras and poses, split, problems.
 * ``mmsynth fit``: ``fit_run`` → ``Run``: a fit with its report and ``runs/latest``. ``fit``: the field alone.
 * ``mmsynth prior``: ``make_prior``; ``find_prior`` reads one, for ``fit_run(..., prior=...)``.
+* ``mmsynth view``: ``serve(open_viewer(run.field, run.scene, run.folder))``. ``mmsynth video``: ``write_video``.
 * ``mmsynth evaluate``: ``evaluate_run(open_run())``, ``evaluate_conversions``. ``evaluate``: the scores alone.
 * ``mmsynth convert``: ``convert_files``. ``convert``: tensors in, tensors out.
 * ``mmsynth generate-dataset``: ``generate_dataset``, ``verify_dataset``. ``AlignedDataset`` reads one for training.
@@ -49,8 +50,10 @@ if TYPE_CHECKING:
     from mmsynth.operations.mesh.files import write_mesh
     from mmsynth.operations.simulation.calibrate_noise import calibrate_noise
     from mmsynth.operations.simulation.simulate import simulate
+    from mmsynth.operations.views.video import write_video
     from mmsynth.scene.load import load_scene
     from mmsynth.sensors.twin import SensorTwin
+    from mmsynth.viewer.open import open_viewer, serve
     from mmsynth.workflows.batch import run_batch
     from mmsynth.workflows.calibrate import calibrate_rig
     from mmsynth.workflows.fit import evaluate_run, fit_run
@@ -76,8 +79,10 @@ _NAMES = {
     "operations.mesh.files": "write_mesh",
     "operations.simulation.calibrate_noise": "calibrate_noise",
     "operations.simulation.simulate": "simulate",
+    "operations.views.video": "write_video",
     "scene.load": "load_scene",
     "sensors.twin": "SensorTwin",
+    "viewer.open": "open_viewer serve",
     "workflows.batch": "run_batch",
     "workflows.calibrate": "calibrate_rig",
     "workflows.fit": "evaluate_run fit_run",
@@ -91,8 +96,8 @@ __all__ = [
     "AlignedDataset", "DivergedError", "Field", "InputError", "Recipe", "Rendering", "Run", "SensorTwin", "calibrate_noise",
     "calibrate_rig", "convert", "convert_files", "evaluate", "evaluate_conversions", "evaluate_run", "export_scene", "extract_mesh",
     "find_prior", "fit", "fit_run", "generate_dataset", "load_recipe", "load_scene", "make_prior",
-    "mesh_to_file", "open_run", "pose_scene", "run_batch", "simulate",
-    "verify_dataset", "write_mesh",
+    "mesh_to_file", "open_run", "open_viewer", "pose_scene", "run_batch", "serve", "simulate",
+    "verify_dataset", "write_mesh", "write_video",
 ]  # fmt: skip
 
 

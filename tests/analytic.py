@@ -123,6 +123,23 @@ class AnalyticField:
             out |= {"roughness": np.where(hit, 0.25, np.nan), "strength": np.where(hit, 2.0, np.nan)}
         return {key: value.astype(np.float32) for key, value in out.items()}
 
+    device = torch.device("cpu")
+
+    def to_normalised(self, points: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(((np.asarray(points) - np.array(self.region.centre)) / self.region.radius).astype(np.float32))
+
+    def render_rays(
+        self, origins: torch.Tensor, directions: torch.Tensor, camera_x: torch.Tensor, modalities: Sequence[str], geometry: bool
+    ) -> dict[str, torch.Tensor]:
+        """Of the normalised frame, as ``Field.render_rays``; depth alone."""
+        centre = np.array(self.region.centre)
+        poses = [
+            look_at(o.numpy() * self.region.radius + centre, (o + d).numpy() * self.region.radius + centre)
+            for o, d in zip(origins, directions, strict=True)
+        ]
+        depth = [self.cast(np.array([[0.0, 0.0, 1.0]]), pose, [], False)["depth"] for pose in poses]
+        return {"depth": torch.from_numpy(np.concatenate(depth))}
+
     def render(
         self,
         camera: Camera,

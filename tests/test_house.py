@@ -20,7 +20,7 @@ ROOMS = """
     sensors scene prior field.kernels field fitting
     operations.output operations.views operations.conversion operations.simulation operations.dataset operations.mesh operations.evaluation
     operations.export
-    report workflows bench cli
+    report viewer workflows bench cli
 """.split()
 
 ROOT = Path(mmsynth.__file__).parent

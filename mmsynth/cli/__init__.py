@@ -1,15 +1,15 @@
 """The command line: each command parses, calls one public function, and prints.
 
-``capture``, ``fields``, ``products`` and ``bench`` have the commands, ``arguments`` their options, ``terminal`` what all of them print
-with.
+``capture``, ``fields``, ``products``, ``looking`` and ``bench`` have the commands, ``arguments`` their options, ``terminal`` what all of
+them print with.
 """
 
 import os
 
-from mmsynth.cli import bench, capture, fields, products
+from mmsynth.cli import bench, capture, fields, looking, products
 from mmsynth.cli.terminal import app
 
-__all__ = ["app", "bench", "capture", "fields", "main", "products"]
+__all__ = ["app", "bench", "capture", "fields", "looking", "main", "products"]
 
 
 def main() -> None:

@@ -28,6 +28,7 @@ from mmsynth.cli.arguments import (
     scene_path,
     sensor_folders,
 )
+from mmsynth.cli.looking import LiveView, PortOption
 from mmsynth.cli.terminal import command, progress_bar
 from mmsynth.errors import InputError
 
@@ -81,6 +82,8 @@ def fit(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    view: Annotated[bool, typer.Option("--view", help="show the field in the browser while it is learned")] = False,
+    port: PortOption = 8080,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="every choice that was made for the scene, and why")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -95,6 +98,10 @@ def fit(
     from mmsynth.workflows.fit import fit_run
     from mmsynth.workflows.prior import find_prior
 
+    if view:
+        from mmsynth.viewer.viewer import require_free
+
+        require_free("127.0.0.1", port)
     seconds = fit_length(steps, budget)
     stated = None if exposure is None else read_exposure(exposure)
     meaning, folder = masks_of(masks)
@@ -120,10 +127,14 @@ def fit(
                 say(line)
             told.update(choices)
 
+        live = LiveView(loaded, port, say) if view else None
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
             prior=of_scenes, exposure=stated, on_start=lambda needs: explain(needs.choices), on_step=on_step,
+            on_field=live,
         )  # fmt: skip
+        if live is not None:
+            live.close()
         explain(choices_of(fitted.field.manifest))  # with what residuals decided on the way
     print(json.dumps(fitted.facts()) if as_json else fit_text(fitted.facts()))
 

@@ -58,6 +58,7 @@ def convert(
     """Convert frames of one modality into another, at the frames' poses or at any poses."""
     from mmsynth.files import read_json
     from mmsynth.operations.conversion.files import convert_files
+    from mmsynth.report.conversion import source_previews, write_conversion_report
     from mmsynth.report.text import converted_text
     from mmsynth.scene.scene import canonical_modality
     from mmsynth.workflows.runs import open_run
@@ -72,8 +73,11 @@ def convert(
             field, scene, destination, source=source, target=target, frames=view_ids(views), views=poses, images=images or (),
             method=cast("Method", method), as_sensor=as_sensor, file_format=cast("RecordFormat", file_format), progress=show,
         )  # fmt: skip
+    sidecars = [path for path in written if path.suffix == ".json"]
     if not as_json:
-        print(converted_text([read_json(path) for path in written if path.suffix == ".json"]))
+        print(converted_text([read_json(path) for path in sidecars]))
+    sensor = field.sensors[canonical_modality(source)]
+    written.append(write_conversion_report(destination, sidecars, sensor, source_previews(scene, sensor, images or ())))
     print_written(destination, written, as_json)
 
 
@@ -122,6 +126,7 @@ def generate_dataset(
     from mmsynth.operations.dataset import generate as dataset
     from mmsynth.operations.dataset.index import verify_dataset
     from mmsynth.operations.output.work_partition import local_device, partition_of_environment
+    from mmsynth.report.dataset import write_dataset_report
     from mmsynth.workflows.runs import latest_run, open_run
 
     if verify:
@@ -144,6 +149,8 @@ def generate_dataset(
             sensors=[*(sensor or ()), *(folder / "sensors" / f"{name}.toml" for name in (names or field.sensors) if raw)], seed=seed,
             part=part, progress=show,
         )  # fmt: skip
+    if made.path is not None:
+        write_dataset_report(made.path.parent)
     if as_json:
         unseen = [{"name": name, "coverage_score": score} for name, score in made.left_out]
         print(json.dumps({"dataset": None if made.path is None else str(made.path), "views": made.views, "left_out": unseen}))

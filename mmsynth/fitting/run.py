@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from mmsynth.field.field import Field
+from mmsynth.field.kernels import Sampling
 from mmsynth.field.samples import learn_from_frames, sample_field
 from mmsynth.field.storage import save_field
 from mmsynth.field.warmup import warm_up
@@ -53,6 +54,7 @@ def fit(
     exposure: Exposure | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
+    on_field: Callable[[Field], None] | None = None,
 ) -> Field:
     """Learn the field of a scene and write it into a run folder.
 
@@ -62,7 +64,8 @@ def fit(
             checkpoint was planned for, else 60 s.
         device: cpu or cuda. resume: go on from the run's checkpoint, if it has one.
         prior: to predict modalities that the scene lacks. exposure: of the scene; None: what it states.
-        on_start: called once with what the scene was found to need. on_step: called after every step.
+        on_start: called once with what the scene was found to need. on_step: called after every step. on_field: called then with the field
+            as it is, which it may render.
     Raises:
         InputError: the scene or recipe cannot be read, the run folder cannot be written, a checkpoint does not fit, or the prior has no
             channels in common with the scene.
@@ -105,6 +108,9 @@ def fit(
         trainer.state.elapsed = before + now - began
         if on_step is not None:
             on_step(trainer.report())
+        if on_field is not None:
+            trainer.field.sampling = _rendered_sampling(trainer)
+            on_field(trainer.field)
         if now - last_logged > _LOG_SECONDS or trainer.progress >= 1.0:
             news = trainer.report()
             log.append(json.dumps({"step": news.step, "elapsed": round(news.elapsed, 3), "loss": news.loss, "psnr": news.psnr}))
@@ -162,12 +168,17 @@ def _save(run: Path, trainer: Trainer, log: list[str]) -> None:
     write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
 
 
+def _rendered_sampling(trainer: Trainer) -> Sampling:
+    """How finely the field is rendered, as far as the fit is."""
+    now = sampling_at(trainer.progress, trainer.recipe, trainer.needs)
+    return now._replace(step=now.step * trainer.recipe.sampling.rendered_step_factor)
+
+
 def _finished(trainer: Trainer) -> Field:
     """The field with the mean of its last parameters, the step of its renderings and the corrected poses."""
     field = trainer.field
     trainer.average.apply()
-    last = sampling_at(1.0, trainer.recipe, trainer.needs)
-    field.sampling = last._replace(step=last.step * trainer.recipe.sampling.rendered_step_factor)
+    field.sampling = _rendered_sampling(trainer)
     field.occupancy.update(
         lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
     )

@@ -19,7 +19,7 @@ from mmsynth.scene.colour_chart import ChartColours, chart_colours
 from mmsynth.scene.encoding import encoding_of
 from mmsynth.scene.images import read_native
 from mmsynth.scene.lattice import CLIPPED, Lattice, find_lattices, mean_of_cell
-from mmsynth.scene.scene import Frame, Sensor
+from mmsynth.scene.scene import Frame, Scene, Sensor
 
 _FRAMES, _LEAST = 6, 6  # that are looked at; black and white of a board that must agree
 _DARK = 0.4  # of white: the most that is black
@@ -63,6 +63,12 @@ def preview_colours_of(sensor: Sensor, frames: Sequence[Frame]) -> PreviewColour
     except InputError:
         return None  # whoever needs the picture says so
     return _by_charts(charts) or _by_board(steps)
+
+
+def preview_colours(scene: Scene) -> dict[str, PreviewColours]:
+    """``preview_colours_of`` every sensor of a scene that has any."""
+    found = {name: preview_colours_of(sensor, scene.frames_of(name)) for name, sensor in scene.sensors.items()}
+    return {name: colours for name, colours in found.items() if colours is not None}
 
 
 def _by_charts(charts: Sequence[ChartColours]) -> PreviewColours | None:

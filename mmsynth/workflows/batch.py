@@ -18,6 +18,7 @@ from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.dataset.plan import DatasetFormat
 from mmsynth.operations.output.work_partition import WorkPartition, local_device
 from mmsynth.operations.views.load import Rig
+from mmsynth.report.dataset import write_dataset_report
 from mmsynth.report.report import write_run_report
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import MaskMeaning, Scene
@@ -108,6 +109,8 @@ def _fit_and_generate(path: Path, out: Path, job: SceneJob) -> dict[str, Any]:
         made = generate_dataset(
             field, job.poses, out / "dataset", scene=scene, rig=job.rig, file_format=job.file_format, outputs=outputs
         ).path
+        if made is not None:
+            write_dataset_report(made.parent)
     return {"run": str(run), "dataset": None if made is None else str(made), "train_psnr": field.manifest["train_psnr"]}
 
 

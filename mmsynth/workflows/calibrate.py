@@ -25,7 +25,9 @@ def calibrate_rig(
         InputError: as ``read_boards`` and ``calibrate``, or a file cannot be written.
     """
     calibration = calibrate(folder, read_boards(board), reference=reference, progress=progress)
-    write_calibration_report(out.with_name("report.html"), calibration)
-    write_json(out.with_name(f"{out.stem}_report.json"), calibration_to_json(calibration))
+    numbers = out.with_name(f"{out.stem}_report.json")
+    write_json(numbers, calibration_to_json(calibration))
     write_calibration(out, calibration.rig)
+    files = [(out.name, "the rig"), (numbers.name, "deviations, residuals of every board, what was left out")]
+    write_calibration_report(out.with_name("report.html"), calibration, files)
     return calibration

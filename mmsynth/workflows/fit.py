@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mmsynth.field.field import Field
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -33,11 +35,13 @@ def fit_run(
     exposure: Exposure | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
+    on_field: Callable[[Path, Field], None] | None = None,
 ) -> Run:
     """Fit a scene into a run folder with its report, and let ``runs/latest`` be it.
 
     Args:
-        folder: None: a new one in ``runs``, or with ``resume`` the scene's run whose checkpoint is the newest. The others: see ``fit``.
+        folder: None: a new one in ``runs``, or with ``resume`` the scene's run whose checkpoint is the newest. The others: see ``fit``;
+            on_field is given the folder, too.
     Raises:
         InputError: as ``fit``, or there is nothing to resume.
     """
@@ -56,6 +60,7 @@ def fit_run(
         exposure=exposure,
         on_start=on_start,
         on_step=on_step,
+        on_field=None if on_field is None else functools.partial(on_field, folder),
     )
     write_run_report(folder, field, scene=scene)
     mark_latest(folder)

@@ -34,7 +34,7 @@ from mmsynth.packaged import data_folder
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, rig_of
-from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.camera import Camera, ray_map, resized
 
 # every number that a result here depends on: the defaults are tuned from time to time
 SMALL = Recipe().with_changes({
@@ -169,6 +169,22 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, mo
     same = ("exposure", "recipe", "seed", "steps", "train_psnr", "skipped_steps", "grid_reopened")
     assert {k: resumed.manifest[k] for k in same} == {k: whole.manifest[k] for k in same}
     assert resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
+
+
+def test_a_fit_that_is_looked_at_comes_to_the_same_field(scene: Scene, tmp_path: Path) -> None:
+    frame = scene.frames_of("rgb")[0]
+    lit = []
+
+    def render(field: Field) -> None:
+        seen = field.render(resized(frame.camera, 24), field.pose_of(frame))
+        lit.append(float(np.nanmean(seen.channels["rgb"])))
+        assert np.isfinite(seen.depth_ray).any()
+
+    looked_at = fit(scene, tmp_path / "looked_at", recipe=SMALL, steps=16, on_field=render)
+    alone = _tensors(fit(scene, tmp_path / "alone", recipe=SMALL, steps=16))
+    assert len(lit) == 16 and len(set(lit)) > 10  # of a field that changes
+    for name, value in _tensors(looked_at).items():
+        assert torch.equal(value, alone[name]), name
 
 
 @pytest.mark.parametrize("average", [0.0, 0.2])

@@ -77,27 +77,36 @@ def preview_dolp(stokes: np.ndarray) -> np.ndarray:
     return degree_of_linear_polarization(torch.from_numpy(np.nan_to_num(stokes))).clamp(0.0, 1.0).float().numpy()
 
 
-def preview_aolp(stokes: np.ndarray) -> np.ndarray:
-    """Stokes (H, W, 3) → (H, W, 3) float32 display RGB: hue = AoLP, value = DoLP, full saturation.
+def preview_aolp(stokes: np.ndarray, gain: float = 1.0) -> np.ndarray:
+    """Stokes (H, W, 3) → (H, W, 3) float32 display RGB: hue = AoLP, value = DoLP times ``gain``, full saturation.
 
     The hue circle spans 180 degrees of AoLP: red 0 (image right), green 60, blue 120, red again at 180. Unpolarised light
     has no angle and is black.
     """
     stokes = np.nan_to_num(stokes).astype(np.float64)
     hue = (2.0 * angle_of_linear_polarization(torch.from_numpy(stokes)).numpy()) % 360.0
-    hsv = np.stack([hue, np.ones_like(hue), preview_dolp(stokes)], -1).astype(np.float32)
+    hsv = np.stack([hue, np.ones_like(hue), (gain * preview_dolp(stokes)).clip(max=1.0)], -1).astype(np.float32)
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)
 
 
-def preview_depth(depth: np.ndarray) -> np.ndarray:
-    """Depth (H, W), NaN = no hit → (H, W, 3) uint8: near bright, far dark (viridis over the 2nd to 98th percentile), no hit black."""
+def preview_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
+    """Depth (H, W), NaN = no hit → (H, W, 3) uint8: near bright, far dark (viridis), no hit black.
+
+    Args:
+        span: nearest and farthest; None: the 2nd and 98th percentile.
+    """
     hit = np.isfinite(depth)
     if not hit.any():
         return np.zeros((*depth.shape, 3), np.uint8)
-    near, far = np.percentile(depth[hit], (2.0, 98.0))
-    scaled = np.clip((far - np.where(hit, depth, far)) / max(float(far - near), 1e-9), 0.0, 1.0)
-    coloured = cv2.cvtColor(cv2.applyColorMap(to_uint8(scaled), cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
-    return np.where(hit[..., None], coloured, 0).astype(np.uint8)
+    near, far = np.percentile(depth[hit], (2.0, 98.0)) if span is None else span
+    return preview_share((far - depth) / max(float(far - near), 1e-9))
+
+
+def preview_share(share: np.ndarray) -> np.ndarray:
+    """Numbers in [0, 1] (H, W), NaN = none → (H, W, 3) uint8, viridis; none is black."""
+    known = np.isfinite(share)
+    levels = to_uint8(np.where(known, share, 0.0))
+    return np.where(known[..., None], cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB), 0).astype(np.uint8)
 
 
 def preview_normal(normal: np.ndarray) -> np.ndarray:

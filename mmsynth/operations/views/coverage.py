@@ -112,6 +112,26 @@ def coverage(rays: TrainingRays, view: PosedCamera, depth_ray: np.ndarray, norma
     return _coverage(rays, view, _focal(view.camera), depth_ray, normal)
 
 
+def coverage_of_point(frames: Sequence[tuple[np.ndarray, Camera]], view: PosedCamera, point: np.ndarray, normal: np.ndarray) -> float:
+    """Coverage of one surface point (3,) that a view sees, by frames that see it (``visibility``): pose (4, 4) and camera of each."""
+    if not frames:
+        return 0.0
+    cameras = tuple(camera for _, camera in frames)
+    rays = TrainingRays(
+        poses=np.stack([pose for pose, _ in frames]),
+        focal=np.array([_focal(camera) for camera in cameras]),
+        cone=np.full(len(frames), -1.0),
+        cameras=cameras,
+        camera_of=np.arange(len(frames)),
+        place=np.zeros(len(frames), np.int64),
+        small=cameras,
+        depth_ray=(),
+    )
+    centre = view.camera_to_world[:3, 3]
+    facing = towards(normal[None], point[None], centre)
+    return float(_closeness(rays, (point - centre)[None], facing, centre, _focal(view.camera)).max())
+
+
 def view_score(field: Field, rays: TrainingRays, view: PosedCamera) -> float:
     """Mean coverage of what a view sees, in [0, 1], by a sparse grid of its rays; 0 for a view that sees no surface at all.
 

@@ -7,10 +7,12 @@ poses.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from mmsynth.errors import InputError
 from mmsynth.scene.checks import number, whole
@@ -93,6 +95,34 @@ def _interpolate(views: int, poses: Sequence[np.ndarray], reach: float) -> list[
     for axis in range(3):
         out[:, axis, 3] = np.interp(at, way[moved], centres[moved, axis])
     return list(out)
+
+
+def through(keys: Sequence[PosedCamera], views: int, reach: float) -> list[PosedCamera]:
+    """A smooth path through two key poses or more: positions by a cubic spline, rotations by one with continuous angular velocity (SciPy's
+    ``RotationSpline``), focal length by a cubic spline of its logarithm; the size of the pictures is the first one's.
+
+    Args:
+        reach: see ``_interpolate``; keys stand at times by the way between them.
+    Returns:
+        ``views`` cameras, named by their number, the first and last of them the first and last key.
+    """
+    poses = np.stack([key.camera_to_world for key in keys])
+    rotations, centres = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
+    turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    way = np.hypot(np.linalg.norm(np.diff(centres, axis=0), axis=1), reach * turned)
+    at = np.concatenate([[0.0], np.cumsum(np.maximum(way, 1e-3 * max(float(way.mean()), 1e-9)))])  # two keys at one place: a short halt
+    times = np.linspace(0.0, at[-1], views)
+    where, how = CubicSpline(at, centres)(times), RotationSpline(at, rotations)(times).as_matrix()
+    shares = np.array([key.camera.fy / key.camera.height for key in keys])
+    focal = np.exp(CubicSpline(at, np.log(shares))(times)) * keys[0].camera.height
+    out = []
+    for i in range(views):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = how[i], where[i]
+        zoom = focal[i] / keys[0].camera.fy
+        camera = replace(keys[0].camera, fx=keys[0].camera.fx * zoom, fy=keys[0].camera.fy * zoom)
+        out.append(PosedCamera(camera, pose, f"{i:04d}"))
+    return out
 
 
 def _perturb(

@@ -13,7 +13,15 @@ from analytic import MONO, RGB, AnalyticField, Distance, meets_ball, sphere
 from conftest import look_at, ring
 
 from mmsynth.errors import InputError
-from mmsynth.operations.views.coverage import TrainingRays, coverage, covered_views, training_rays, view_score, view_scores
+from mmsynth.operations.views.coverage import (
+    TrainingRays,
+    coverage,
+    coverage_of_point,
+    covered_views,
+    training_rays,
+    view_score,
+    view_scores,
+)
 from mmsynth.scene.scene import Frame, PosedCamera, Region, Scene, Split
 from mmsynth.sensors.camera import Camera, project, resized, surface_points, unproject
 
@@ -199,3 +207,17 @@ def test_resized_camera_sees_the_same() -> None:
     corners = np.array([[-0.5, -0.5], [120.5, -0.5], [120.5, 90.5], [-0.5, 90.5]])
     on_small = np.array([[1.5, 1.5], [41.5, 1.5], [41.5, 31.5], [1.5, 31.5]])
     np.testing.assert_allclose(unproject(corners, LENS)[0], unproject(on_small, small)[0], atol=1e-12)
+
+
+def test_of_one_point_it_is_that_of_its_pixel() -> None:
+    field, poses = field_of(sphere()), ring(5, 2.2, 0.7)
+    view = look_at((1.9, 0.8, 0.9))
+    out, points = covered(field, rays_of(field, *poses[:3]), view)
+    normal = field.render(LENS, view, []).normal
+    inner = np.argwhere(np.isfinite(out))
+    for row, column in inner[:: len(inner) // 7]:
+        point, facing = points[row, column], normal[row, column]
+        seeing = [(pose, LENS) for pose in poses[:3] if facing @ (pose[:3, 3] - point) > 0.02]
+        found = coverage_of_point(seeing, PosedCamera(LENS, view), point, facing)
+        assert found == pytest.approx(out[row, column], abs=0.01)
+    assert coverage_of_point([], PosedCamera(LENS, view), points[45, 60], normal[45, 60]) == 0.0

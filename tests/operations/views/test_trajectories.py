@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import RGB, AnalyticField, ring_pose, scene_of, sphere
-from conftest import unpacked
+from conftest import ring, unpacked
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from mmsynth.errors import InputError
 from mmsynth.operations.views.load import load_views
-from mmsynth.operations.views.trajectories import look_at, trajectory_views, world_up
-from mmsynth.scene.scene import Frame, Region
+from mmsynth.operations.views.trajectories import look_at, through, trajectory_views, world_up
+from mmsynth.scene.scene import Frame, PosedCamera, Region
 from mmsynth.sensors.camera import Camera
 
 CAMERA = Camera(24, 18, 26.0, 26.0, 11.5, 8.5)
@@ -223,3 +224,33 @@ def test_load_views(tmp_path: Path) -> None:
     path.write_text(json.dumps({"trajectory": "interpolate"}))
     with pytest.raises(InputError, match="0 training poses"):
         load_views(path, field)  # type: ignore[arg-type]
+
+
+def test_a_path_through_keys_meets_them_and_is_smooth() -> None:
+    keys = [PosedCamera(CAMERA, pose) for pose in ring(5)[:4]]
+    views = through(keys, 301, 1.0)
+    assert [view.name for view in views[:2]] == ["0000", "0001"] and len(views) == 301
+    poses = np.stack([view.camera_to_world for view in views])
+    np.testing.assert_allclose(poses[0], keys[0].camera_to_world, atol=1e-9)
+    np.testing.assert_allclose(poses[-1], keys[-1].camera_to_world, atol=1e-9)
+    for key in keys:  # met between two of the views
+        assert np.abs(poses - key.camera_to_world).max((1, 2)).min() < 0.03
+    np.testing.assert_allclose(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.broadcast_to(np.eye(3), (301, 3, 3)), atol=1e-9)
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    assert np.abs(np.diff(steps, axis=0)).max() < 0.05 * np.linalg.norm(steps, axis=1).mean()  # no corners at the keys
+
+
+def test_a_path_may_zoom_and_halt() -> None:
+    near = replace(CAMERA, fx=2 * CAMERA.fx, fy=2 * CAMERA.fy)
+    first, second = ring(5)[:2]
+    keys = [PosedCamera(CAMERA, first), PosedCamera(CAMERA, second), PosedCamera(near, second)]
+    views = through(keys, 50, 1.0)
+    focal = [view.camera.fy for view in views]
+    assert focal[0] == pytest.approx(CAMERA.fy) and focal[-1] == pytest.approx(2 * CAMERA.fy)
+    assert all(np.isfinite(view.camera_to_world).all() for view in views)
+
+
+def test_two_keys_are_joined_by_a_line_and_a_turn() -> None:
+    first, second = ring(5)[:2]
+    middle = through([PosedCamera(CAMERA, first), PosedCamera(CAMERA, second)], 3, 1.0)[1].camera_to_world
+    np.testing.assert_allclose(middle[:3, 3], 0.5 * (first + second)[:3, 3], atol=1e-9)

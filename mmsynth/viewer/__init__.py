@@ -1,0 +1,1 @@
+"""A field in the browser (viser): looked at, asked, and flown through."""
