@@ -1,4 +1,4 @@
-"""The files of a benchmark: ``results.json``, ``report.md`` and ``plot.svg``, each written whole or not at all."""
+"""The files of a benchmark: ``results.json``, ``report.md``, ``report.html`` and ``plot.svg``, each written whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,6 +15,17 @@ from matplotlib.figure import Figure
 from mmsynth.bench.machine import describe
 from mmsynth.bench.tables import Table, markdown
 from mmsynth.files import write_atomic, write_json, write_text
+from mmsynth.report.page import links_to, svg, write_page
+
+_FILES = (("results.json", "all numbers"), ("report.md", "the tables as Markdown"), ("plot.svg", "the plot"), ("rows/*.json", "one row"))
+
+_BODY = """\
+{% for heading, header, rows, note in tables %}<h2 id="table-{{ loop.index }}">{{ heading }}</h2>
+{{ table(heading, header, rows) }}
+{% if note %}<p class="note">{{ note }}</p>{% endif %}{% endfor %}
+{% if plot %}<h2 id="plot">Plot</h2>{{ drawing(plot, "the numbers of the tables drawn") }}{% endif %}
+<h2 id="files">Files</h2>{{ links(files) }}
+"""
 
 
 @dataclass(frozen=True)
@@ -33,7 +44,7 @@ class Report:
 
 
 def write_report(results: dict[str, Any], tables: Sequence[Table], figure: Figure | None, out: Path) -> Report:
-    """Write the three files, or two where there is nothing to plot.
+    """Write the four files, or three where there is nothing to plot.
 
     Raises:
         InputError: ``out`` cannot be written.
@@ -44,7 +55,19 @@ def write_report(results: dict[str, Any], tables: Sequence[Table], figure: Figur
     if figure is not None:
         write_atomic(out / "plot.svg", lambda path: FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None}))
     write_json(out / "results.json", results)
-    return Report(results, tables, out, ("results.json", "report.md", *(["plot.svg"] if plot else [])))
+    page = {
+        "title": f"mmsynth bench {results['bench']}",
+        "subtitle": describe(results["machine"]),
+        "tables": [(one.title, [c.heading for c in one.filled()], _cells(one), one.note) for one in tables],
+        "plot": None if figure is None else svg(figure),
+        "files": links_to(out, _FILES),
+    }
+    write_page(out / "report.html", _BODY, page)
+    return Report(results, tables, out, ("results.json", "report.md", "report.html", *(["plot.svg"] if plot else [])))
+
+
+def _cells(table: Table) -> list[list[str]]:
+    return [[column.cell(row) for column in table.filled()] for row in table.rows]
 
 
 def new_figure(panels: int, height: float = 4.2) -> tuple[Figure, list[Axes]]:

@@ -1,7 +1,8 @@
-"""``report.html`` of a calibration: residuals, coverage by corners, the rig drawn, every frame that was left out. One file, no script."""
+"""``report.html`` of a calibration: residuals, coverage by corners, the rig drawn, every frame that was left out."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmsynth.report.page import svg, write_page
+from mmsynth.report.page import links_to, svg, write_page
 from mmsynth.scene.capture.board import corner_points
 from mmsynth.scene.capture.calibrate import Calibration
 from mmsynth.sensors.camera import COEFFICIENTS, unproject
@@ -18,21 +19,22 @@ _AXIS = 0.15  # of the rig's extent: how long cameras are drawn
 _BOARDS = 40  # boards drawn at the most
 
 _BODY = """\
-<p class="note">{{ subtitle }}</p>
-{% if problems %}<h2>To know</h2><ul>{% for line in problems %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
-{% for heading, header, rows, note in tables %}<h2>{{ heading }}</h2>
-<div class="scroll"><table><tr>{% for cell in header %}<th>{{ cell }}</th>{% endfor %}</tr>
-{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
-{% endfor %}</table></div><p class="note">{{ note }}</p>{% endfor %}
-<h2>Residuals and coverage</h2>{{ residuals | safe }}
-<p class="note">Left: every corner at its place in the picture with its residual, enlarged as said. Right: all residuals [px].</p>
-<h2>The rig</h2>{{ rig | safe }}<p class="note">Cameras look along their blue axis; boards in grey, in the reference's frame [m].</p>
-<h2>Residuals of every board</h2>{{ boards | safe }}
+{% if problems %}<h2 id="know">To know</h2><ul>{% for line in problems %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
+{% for heading, header, rows, note in tables %}<h2 id="table-{{ loop.index }}">{{ heading }}</h2>
+{% if rows %}{{ table(heading, header, rows) }}{% endif %}<p class="note">{{ note }}</p>{% endfor %}
+<h2 id="residuals">Residuals and coverage</h2>
+{{ drawing(residuals, "residuals of the corners at their places in the pictures, and their scatter",
+"Left: every corner at its place in the picture with its residual, enlarged as said. Right: all residuals [px].") }}
+<h2 id="rig">The rig</h2>
+{{ drawing(rig, "cameras and boards from above and from behind",
+"Cameras look along their blue axis; boards in grey, in the reference's frame [m].") }}
+<h2 id="boards">Residuals of every board</h2>{{ drawing(boards, "rms of the residuals of every board over the instants") }}
+<h2 id="files">Files</h2>{{ links(files) }}
 """
 
 
-def write_calibration_report(path: Path, calibration: Calibration) -> None:
-    """Write the page. Raises InputError: cannot be written."""
+def write_calibration_report(path: Path, calibration: Calibration, files: Sequence[tuple[str, str]] = ()) -> None:
+    """Write the page; ``files``: name and meaning of those beside it. Raises InputError: cannot be written."""
     order = list(calibration.rig)
     page = {
         "title": f"Calibration of {len(order)} sensor{'s' if len(order) > 1 else ''}: {', '.join(order)}",
@@ -42,6 +44,7 @@ def write_calibration_report(path: Path, calibration: Calibration) -> None:
         "residuals": svg(_residuals(calibration)),
         "rig": svg(_rig(calibration)),
         "boards": svg(_by_board(calibration)),
+        "files": links_to(path.parent, files),
     }
     write_page(path, _BODY, page)
 

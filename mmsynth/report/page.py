@@ -1,42 +1,50 @@
-"""What every HTML page of a report has: its head and style, and figures as SVG inside it. One file, no script."""
+"""What every HTML page of a report has: head, style, script, and figures as SVG inside it. One file that asks nothing of a network.
+
+``page.html`` is the frame of every page, ``parts.html`` what pages are made of (tables, pictures, wipes, drawings), ``page.css`` their
+style, on screens, light or dark, and on paper, and ``page.js`` the little that moves: wipes, zoom and the spectrum of a pixel. Without
+the script all pictures and numbers are still there.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
+from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from mmsynth.files import write_text
 
-_HEAD = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem; border-bottom: 1px solid #ddd }
-.scroll { overflow-x: auto } table { border-collapse: collapse }
-td, th { padding: .25rem .8rem; border-bottom: 1px solid #eee; text-align: left; vertical-align: top }
-td.number { text-align: right; font-variant-numeric: tabular-nums }
-figure { display: inline-block; margin: .4rem .6rem .4rem 0 } figcaption { font-size: .85rem; color: #555 }
-figure img { height: 200px; image-rendering: pixelated }
-svg { max-width: 100%; height: auto } .note { color: #555; font-size: .9rem }
-</style></head><body>
-<h1>{{ title }}</h1>
-"""
+_HERE = Path(__file__).parent
+_NUMBER = re.compile(r"[-+<]? ?\d[\d.,]*(e[-+]?\d+)?( ?[%°])?( ± .*)?")
+_BODY = "{% from 'parts.html' import drawing, links, modality, picture, table, wipe with context %}"
 
 
 def write_page(path: Path, body: str, values: Mapping[str, Any]) -> None:
-    """Write a page: ``body`` is the template of what follows its heading, ``values`` what it is filled with, ``title`` among them.
+    """Write a page.
 
+    Args:
+        body: the template of what follows its heading; it may use what ``parts.html`` has. Headings of the second level that have an
+            id are listed at the top.
+        values: what it is filled with, ``title`` among them; ``subtitle``, if there is one, follows the heading.
     Raises:
         InputError: cannot be written.
     """
-    write_text(path, jinja2.Environment(autoescape=True).from_string(_HEAD + body + "</body></html>\n").render(values))
+    environment = jinja2.Environment(autoescape=True, loader=jinja2.FileSystemLoader(_HERE), trim_blocks=True, lstrip_blocks=True)
+    environment.filters["number_columns"] = _number_columns
+    main = environment.from_string(_BODY + body).render(values)
+    headings = re.findall(r'<h2 id="([^"]*)">(.*?)</h2>', main)
+    inside = {"style": Markup((_HERE / "page.css").read_text("utf-8")), "script": Markup((_HERE / "page.js").read_text("utf-8"))}
+    contents = [(anchor, Markup(text)) for anchor, text in headings]
+    page = environment.get_template("page.html").render({**values, **inside, "main": Markup(main), "contents": contents})
+    write_text(path, page + "\n")
 
 
 def svg(figure: Figure) -> str:
@@ -45,3 +53,38 @@ def svg(figure: Figure) -> str:
     FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]
+
+
+@dataclass(frozen=True)
+class Link:
+    """A file beside the page: its name from there, as an address, too, what it is, size as text."""
+
+    name: str
+    address: str
+    about: str
+    size: str
+
+
+def links_to(folder: Path, files: Iterable[tuple[str, str]]) -> list[Link]:
+    """Those files that are in the page's folder; ``files``: pattern of names below it and what they are, in the order of the page."""
+    found: dict[str, Link] = {}
+    for pattern, about in files:
+        for path in sorted(folder.glob(pattern)):
+            name = path.relative_to(folder).as_posix()
+            if path.is_file() and not path.name.startswith("."):
+                found.setdefault(name, Link(name, quote(name), about, size_text(path.stat().st_size)))
+    return list(found.values())
+
+
+def size_text(size: int) -> str:
+    """Bytes → "12 kB"."""
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= scale:
+            return f"{size / scale:.3g} {unit}"
+    return f"{size} B"
+
+
+def _number_columns(rows: Sequence[Sequence[Any]]) -> list[bool]:
+    """Which columns of a table hold numbers alone; they are set to the right."""
+    cells = [[str(cell) for cell in column if str(cell) not in ("", "–")] for column in zip(*rows, strict=False)]
+    return [bool(column) and all(_NUMBER.fullmatch(cell) for cell in column) for column in cells]

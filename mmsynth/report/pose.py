@@ -9,24 +9,30 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mmsynth.report.page import svg, write_page
+from mmsynth.report.page import links_to, svg, write_page
 from mmsynth.scene.capture.pose import PosedCapture
 
 _POINTS = 3000  # drawn at the most
 
+_FILES = (
+    ("meta_data.json", "the scene: cameras, poses, frames"),
+    ("sparse/0/cameras.txt", "COLMAP's model: lenses"),
+    ("sparse/0/images.txt", "COLMAP's model: poses"),
+    ("sparse/0/points3D.txt", "COLMAP's model: points"),
+    ("sparse/0/*.bin", "COLMAP's model"),
+)
+
 _BODY = """\
-<p>{{ subtitle }}</p>
 {% for note in notes %}<p class="note">{{ note }}</p>
 {% endfor %}
-{% for heading, columns, rows in tables if rows %}<h2>{{ heading }}</h2>
-<div class="scroll"><table><tr>{% for c in columns %}<th>{{ c }}</th>{% endfor %}</tr>
-{% for row in rows %}<tr>{% for v in row %}<td class="number">{{ v }}</td>{% endfor %}</tr>
-{% endfor %}</table></div>{% endfor %}
-<h2>Cameras and points</h2>
-<p class="note">Seen along the mean of the cameras' up axes, and from the side. The circle is the region of interest.</p>
-{{ drawing | safe }}
-<h2>Reprojection error of every picture</h2>
-{{ residuals | safe }}
+{% for heading, columns, rows in tables if rows %}<h2 id="table-{{ loop.index }}">{{ heading }}</h2>
+{{ table(heading, columns, rows) }}{% endfor %}
+<h2 id="cameras">Cameras and points</h2>
+{{ drawing(drawn, "cameras and points from above and from the side",
+"Seen along the mean of the cameras' up axes, and from the side. The circle is the region of interest.") }}
+<h2 id="residuals">Reprojection error of every picture</h2>
+{{ drawing(residuals, "rms of the reprojection error of every picture, by sensor") }}
+{% if files %}<h2 id="files">Files</h2>{{ links(files) }}{% endif %}
 """
 
 
@@ -50,10 +56,11 @@ def write_pose_report(path: Path, posed: PosedCapture, facts: Mapping[str, Any])
                 ("sensor", "moved [mm]", "turned [°]"),
                 [(n, f"{1000 * m['length']:.3f}", f"{m['degrees']:.4f}") for n, m in facts["rig_moved"].items()],
             ),
-            ("Cameras", ("sensor", "", ""), intrinsics),
+            ("Cameras", ("sensor", "parameter", "value"), intrinsics),
         ],
-        "drawing": _drawing(posed),
+        "drawn": _drawing(posed),
         "residuals": _residuals(posed),
+        "files": links_to(path.parent, _FILES),
     }
     write_page(path, _BODY, page)
     return path

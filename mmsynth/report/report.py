@@ -1,26 +1,24 @@
-"""One self-contained HTML page per run: decisions, curve, test views, scores. No script, no network, no other file."""
+"""One self-contained HTML page per run: scores, test views, curve, decisions, files."""
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
 from mmsynth.fitting.choices import choices_of
 from mmsynth.operations.output import previews
-from mmsynth.report.page import svg, write_page
-from mmsynth.scene.images import load_frame
-from mmsynth.scene.preview_colours import preview_colours_of
-from mmsynth.scene.scene import Frame, Scene, Sensor
-from mmsynth.sensors.mosaic import channels_of, demosaic_edge_aware, is_bayer
-from mmsynth.sensors.polarization import intensities_to_stokes
+from mmsynth.report.page import links_to, svg, write_page
+from mmsynth.report.pictures import Picture, Row, encode_rows
+from mmsynth.report.run_pictures import measured_channels as measured_channels
+from mmsynth.report.run_pictures import picture_rows
+from mmsynth.scene.scene import Scene
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -47,23 +45,50 @@ _COLUMNS = {
     "aolp_mae": ("AoLP error [°]", 2),
 }
 
+_PARTS = ("psnr_highlights", "psnr_silhouettes", "psnr_rest")
+
+# files of a run folder and of what was made of it, as far as they are there
+_FILES = (
+    ("field.safetensors", "the field"),
+    ("manifest.json", "scene, recipe, decisions, versions, times"),
+    ("train.jsonl", "the curve"),
+    ("preview.png", "the pictures of this page on one sheet"),
+    ("checkpoint/state.pt", "to go on from"),
+    ("*.ply", "mesh"),
+    ("*.glb", "mesh"),
+    ("*.obj", "mesh"),
+    ("*.stl", "mesh"),
+    ("dataset/report.html", "the dataset's page"),
+    ("dataset/dataset.json", "dataset"),
+    ("convert/*/report.html", "a conversion's page"),
+    ("videos/*.mp4", "video"),
+    ("sensors/*.toml", "sensor with its noise"),
+    ("simulated/meta_data.json", "simulated raw frames"),
+    ("export/*/transforms*.json", "exported scene"),
+)
+
 _BODY = """\
-<p class="note">{{ subtitle }}</p>
-{% if scores %}<h2>Scores on the test views</h2>
-<div class="scroll"><table><tr><th>modality</th>{% for c in columns %}<th>{{ c }}</th>{% endfor %}</tr>
-{% for name, row in scores %}<tr><td>{{ name }}</td>{% for v in row %}<td class="number">{{ v }}</td>{% endfor %}</tr>
-{% endfor %}</table></div>
-<p class="note">{{ score_note }}</p>{% endif %}
-{% if rows %}<h2>{{ pictures_title }}</h2>
-{% for row in rows %}<div>{% for caption, source in row %}<figure><img src="{{ source }}" alt="{{ caption }}">
-<figcaption>{{ caption }}</figcaption></figure>{% endfor %}</div>
-{% endfor %}
-<p class="note">Previews are tone-mapped, the frame and its rendering with one exposure; frames are demosaicked for display
-only.</p>{% endif %}
-{% if curve %}<h2>The fit</h2>{{ curve | safe }}{% endif %}
-{% for heading, lines in tables if lines %}<h2>{{ heading }}</h2>
-<table>{% for k, v in lines %}<tr><td>{{ k }}</td><td>{{ v }}</td></tr>{% endfor %}</table>
-{% endfor %}"""
+{% if scores %}<h2 id="scores">Scores on the test views</h2>
+{{ table("scores on the test views", ["modality"] + columns, scores) }}
+<p class="note">{{ score_note }}</p>
+{% if parts %}<h3>Where the error lies</h3>
+{{ table("PSNR of highlights, silhouettes and the rest", ["modality"] + part_columns, parts) }}
+<p class="note">Highlights are brighter than what is around them, silhouettes edges of objects and steps of depth.</p>
+{% endif %}{% endif %}
+{% if rows %}<h2 id="pictures">{{ pictures_title }}</h2>
+<p class="note">Pictures are tone-mapped, the frame and its rendering with one exposure; frames are demosaicked for display only. Errors are
+|frame - rendering|, the mean over channels; all modalities have one scale.</p>
+<p class="note hint">Point at a picture for the light of a pixel, or go there by Tab and use the arrow keys; click or Enter enlarges it.</p>
+{% for row in rows %}{{ modality(row) }}{% endfor %}{% endif %}
+{% if curve %}<h2 id="fit">The fit</h2>
+{{ drawing(curve, "loss and PSNR of the training rays over seconds") }}{% endif %}
+{% if decided %}<h2 id="decided">What was decided and why</h2>
+{{ table("what was decided and why", ["choice", "value", "why"], decided) }}
+<p class="note">In bold: what changed the field or the fit.</p>{% endif %}
+<div class="columns">{% for id, heading, lines in tables if lines %}<section><h2 id="{{ id }}">{{ heading }}</h2>
+{{ table(heading, ["what", "value"], lines) }}</section>{% endfor %}</div>
+{% if files %}<h2 id="files">Files</h2>{{ links(files) }}{% endif %}
+"""
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -110,89 +135,22 @@ def _number(value: Any) -> float:
     return float(value) if isinstance(value, (int, float)) else float("nan")
 
 
-def _source(image: np.ndarray) -> str:
-    """Display image → data URI."""
-    return "data:image/png;base64," + base64.b64encode(previews.encode_png(image)).decode("ascii")
-
-
-def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
-    """A frame with all channels at every pixel (H, W, C), demosaicked for display; times its alpha, as it is fitted and scored."""
-    pixels, alpha = load_frame(sensor, frame)
-    if alpha is not None:
-        pixels = pixels * alpha[..., None]
-    if sensor.mosaic is not None and is_bayer(sensor.mosaic):
-        return np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
-    return channels_of(pixels, sensor.mosaic)
-
-
-def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[list[tuple[str, np.ndarray]]]]:
-    """Per modality (caption, display image): frame | rendering | difference, for polarization also AoLP and DoLP; last depth and normals.
-
-    Returns:
-        the id of the first test view (None: no frame) and the rows.
-    """
-    names = [name for name in field.measured if name in scene.sensors]
-    frames = {name: (scene.frames_of(name, scene.split.test) or scene.frames_of(name))[:1] for name in names}
-    rows: list[list[tuple[str, np.ndarray]]] = []
-    geometry: list[tuple[str, np.ndarray]] = []
-    view: int | None = None
-    for name in names:
-        for frame in frames[name]:
-            sensor = field.sensors[name]
-            first = view is None
-            view = frame.view if view is None else view
-            measured = measured_channels(scene.sensors[name], frame)
-            rendering = field.render(frame.camera, field.pose_of(frame), [name], geometry=first)
-            ours = rendering.channels[name]
-            colours = preview_colours_of(scene.sensors[name], scene.frames_of(name))
-            linear = previews.preview_linear(sensor, measured, colours)
-            exposure = previews.exposure_of(linear)
-            difference = np.abs(np.nan_to_num(ours) - measured).mean(-1) * rendering.valid
-            row = [
-                (f"{name}: frame {frame.view}", previews.to_uint8(previews.tone_map(linear, exposure))),
-                ("rendering", previews.preview_rgb(sensor, ours, exposure, colours)),
-                ("difference x 5", previews.to_uint8(5.0 * difference)),
-            ]
-            if sensor.polarizer_angles_deg is not None:
-                stokes = intensities_to_stokes(torch.from_numpy(measured), sensor.polarizer_angles_deg).numpy()
-                row += [("AoLP (hue), DoLP (value): frame", previews.to_uint8(previews.preview_aolp(stokes)))]
-                row += [("rendering", previews.to_uint8(previews.preview_aolp(rendering.stokes[name])))]
-            if first:
-                geometry = [("depth", previews.preview_depth(rendering.depth_z)), ("normals", previews.preview_normal(rendering.normal))]
-                geometry.append(("opacity", previews.to_uint8(rendering.opacity)))
-            rows.append(row)
-    shown = next((of[0] for of in frames.values() if of), None)
-    if field.predicted and shown is not None:
-        rows += _predicted_rows(field, shown)
-    return view, [*rows, geometry] if rows else rows
-
-
-def _predicted_rows(field: Field, frame: Frame) -> list[list[tuple[str, np.ndarray]]]:
-    """Of each modality that a prior predicts, at a frame's pose: prediction | deviation, for polarization also AoLP and DoLP."""
-    rendering = field.render(frame.camera, field.pose_of(frame), field.predicted, geometry=False)
-    rows = []
-    for name in field.predicted:
-        sensor, ours = field.sensors[name], rendering.channels[name]
-        exposure = previews.exposure_of(previews.preview_linear(sensor, ours))
-        deviation = np.nan_to_num(rendering.deviation[name]).mean(-1)
-        row = [
-            (f"{name}: predicted", previews.preview_rgb(sensor, ours, exposure)),
-            ("its deviation x 5", previews.to_uint8(5.0 * deviation)),
-        ]
-        if sensor.is_polarization:
-            row += [("AoLP (hue), DoLP (value): predicted", previews.to_uint8(previews.preview_aolp(rendering.stokes[name])))]
-        rows.append(row)
-    return rows
-
-
-def _score_table(evaluation: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+def _score_tables(evaluation: Mapping[str, Any]) -> dict[str, Any]:
+    """Scores of the modalities, and those of the parts of pictures, where these are known, as a table of their own."""
     modalities: Mapping[str, Mapping[str, Any]] = evaluation.get("modalities", {})
-    keys = [key for key in _COLUMNS if any(key in scores for scores in modalities.values())]
-    table = [
-        (f"{name} (predicted)" if scores.get("predicted") else name, [_shown(scores.get(key), _COLUMNS[key][1]) for key in keys])
-        for name, scores in modalities.items()
-    ]
-    return [_COLUMNS[key][0] for key in keys], table
+
+    def rows(keys: Sequence[str], of: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+        label = {name: f"{name} (predicted)" if scores.get("predicted") else name for name, scores in of.items()}
+        return [[label[name], *(_shown(scores.get(key), _COLUMNS[key][1]) for key in keys)] for name, scores in of.items()]
+
+    told = [key for key in _COLUMNS if any(key in scores for scores in modalities.values())]
+    whole, parts = [key for key in told if key not in _PARTS], [key for key in told if key in _PARTS]
+    return {
+        "columns": [_COLUMNS[key][0] for key in whole],
+        "scores": rows(whole, modalities),
+        "part_columns": [_COLUMNS[key][0] for key in parts],
+        "parts": rows(parts, {n: s for n, s in modalities.items() if any(key in s for key in parts)}),
+    }
 
 
 def _shown(value: Any, decimals: int = 4) -> str:
@@ -227,6 +185,28 @@ def _flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
     return [(prefix, str(value))] if not isinstance(value, (list, tuple)) or len(value) <= 12 else []
 
 
+def _decided(manifest: Mapping[str, Any]) -> list[list[str]]:
+    """Choice, value, why; what changed something in bold."""
+    rows = []
+    for name, choice in choices_of(manifest).items():
+        # the reason of a switch begins with its value
+        why = choice.why.split(": ", 1)[-1] if choice.why.startswith(("on: ", "off: ")) else choice.why
+        shown = Markup("<strong>{}</strong>") if choice.changed else Markup("{}")
+        rows.append([shown.format(name.replace("_", " ")), shown.format(_plain(choice.value)), why])
+    return rows
+
+
+def _plain(value: Any) -> str:
+    """A value of a choice as a reader would write it."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_plain(inner)}" for key, inner in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_plain(inner) for inner in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
 _RUN_FACTS = ("mmsynth", "seed", "steps", "seconds", "rays_per_s", "samples_per_s", "versions", "threads", "cores", "device")
 
 
@@ -250,34 +230,38 @@ def write_run_report(
     log = read_log(train_log or run_dir / "train.jsonl") if train_log is None or isinstance(train_log, (str, Path)) else train_log
     scene = _scene_of(manifest) if scene is None else scene
     view, rows = picture_rows(field, scene) if scene is not None else (None, [])
-    columns, scores = _score_table(evaluation or {})
     needs = manifest.get("needs", {})
     name = scene.root.resolve().name if scene is not None else run_dir.name
     region = field.region
     centre = ", ".join(f"{c:.4g}" for c in region.centre)
-    facts = _flat({key: manifest[key] for key in _RUN_FACTS if key in manifest})
-    needed = [(name, choice.why) for name, choice in choices_of(manifest).items()] + _flat(
-        {k: v for k, v in needs.items() if k != "choices"}
-    )
+    if rows:
+        images = [[picture.image for picture in _on_sheet(row)] for row in rows]
+        captions = [[f"{row.title}: {p.caption}" if i == 0 else p.caption for i, p in enumerate(_on_sheet(row))] for row in rows]
+        previews.contact_sheet(images, captions, run_dir / "preview.png")
     page = {
         "title": f"mmsynth: {name}",
         "subtitle": f"{len(field.sensors)} modalities: {', '.join(field.sensors)}. "
         f"Region of interest: centre {centre}, radius {region.radius:.4g} [{field.unit}].",
-        "columns": columns,
-        "scores": scores,
+        **_score_tables(evaluation or {}),
         "score_note": _score_note(evaluation or {}, field.unit),
         "pictures_title": f"View {view}",
-        "rows": [[(caption, _source(image)) for caption, image in row] for row in rows],
+        "rows": encode_rows(rows),
         "curve": curve_svg(log),
-        "tables": [("What the scene needed", needed), ("The run", facts)],
+        "decided": _decided(manifest),
+        "tables": [
+            ("needed", "What the scene needed", _flat({k: v for k, v in needs.items() if k != "choices"})),
+            ("run", "The run", _flat({key: manifest[key] for key in _RUN_FACTS if key in manifest})),
+        ],
+        "files": links_to(run_dir, _FILES),
     }
-    if rows:
-        images = [[image for _, image in row] for row in rows]
-        captions = [[caption for caption, _ in row] for row in rows]
-        previews.contact_sheet(images, captions, run_dir / "preview.png")
     path = run_dir / "report.html"
     write_page(path, _BODY, page)
     return path
+
+
+def _on_sheet(row: Row) -> list[Picture]:
+    """Every picture of a row once."""
+    return list({id(picture): picture for picture in row.each()}.values())
 
 
 def _scene_of(manifest: Mapping[str, Any]) -> Scene | None:

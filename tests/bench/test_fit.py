@@ -46,7 +46,7 @@ def test_one_fit_per_budget_and_three_files(fits: list[Job], tmp_path: Path) -> 
         assert part in text
     assert "normals" not in text  # none of the scores has them
     assert (tmp_path / "plot.svg").read_text().count("<svg") == 1
-    assert {path.name for path in tmp_path.iterdir()} == {"results.json", "report.md", "plot.svg", "rows"}
+    assert {path.name for path in tmp_path.iterdir()} == {"results.json", "report.md", "report.html", "plot.svg", "rows"}
     assert calls == [(0, 2), (1, 2), (2, 2)]
 
 

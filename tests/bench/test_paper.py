@@ -215,7 +215,8 @@ def test_tables_state_what_they_are_of(fits: list[Job], two_scenes: list[Path], 
         for part in ("Scenes: example_scene, scene; 2m a fit; seed 7.", "s in all", f"on {cores} cores, {threads} thread"):
             assert part in table.note
     assert "rgb + 25 frames" in report.tables[1].note and "rgb + 5 frames" not in report.tables[1].note
-    assert report.files == ("results.json", "report.md") and json.loads((tmp_path / "out" / "results.json").read_text()) == report.results
+    assert report.files == ("results.json", "report.md", "report.html")
+    assert json.loads((tmp_path / "out" / "results.json").read_text()) == report.results
 
 
 def test_rays_of_each_modality_are_equal_in_fits_of_equal_steps(fits: list[Job], tmp_path: Path) -> None:

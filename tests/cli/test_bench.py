@@ -39,7 +39,7 @@ def test_bench_fit_goes_on_where_it_was(tmp_path: Path) -> None:
     assert row["name"] == "0.3s" and row["seed"] == 0 and row["steps"] >= 1
     assert set(row["scores"]["modalities"]) == {"rgb", "pol"} and {"psnr", "psnr_truth", "psnr_truth_full"} <= set(row["mean"])
     out = tmp_path / "bench" / "fit"
-    assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "plot.svg", "rows"}
+    assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "plot.svg", "rows"}
     (file,) = (out / "rows").iterdir()
     made = file.stat().st_mtime_ns
     again = run(tmp_path, "bench", "fit", "example", "--budgets", "0.3s", "--modalities", "rgb,pol", "--frames", "polarization=2")
@@ -78,7 +78,7 @@ def test_bench_paper(tmp_path: Path) -> None:
     assert {"psnr_view_mean", "psnr_foreground", "ssim", "seconds"} <= {line["score"] for line in table["lines"]}
     made = {file: file.stat().st_mtime_ns for file in (tmp_path / "here" / "rows").iterdir()}
     again = call(*command)
-    assert again.exit_code == 0 and "wrote here/ (results.json, report.md)" in again.stdout and "PSNR, pooled" in again.stdout
+    assert again.exit_code == 0 and "wrote here/ (results.json, report.md, report.html)" in again.stdout and "PSNR, pooled" in again.stdout
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "here" / "rows").iterdir()} == made
 
 
@@ -125,14 +125,14 @@ def test_bench_numerics(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     results = json.loads(result.stdout)
     assert results["out"] == "bench/numerics" and {row["family"] for row in results["rows"]} == {"angles", "resampling"}
-    assert {path.name for path in (tmp_path / "bench" / "numerics").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    assert {path.name for path in (tmp_path / "bench" / "numerics").iterdir()} == {"results.json", "report.md", "report.html", "plot.svg"}
     refused(call("bench", "numerics", "--only", "magic"), "'magic'", "undistortion")
 
 
 def test_bench_twin(tmp_path: Path) -> None:
     result = call("bench", "twin", "--only", "optics,spectra", "--out", "here")
     assert result.exit_code == 0 and "wrote here/" in result.output, result.output
-    assert {path.name for path in (tmp_path / "here").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    assert {path.name for path in (tmp_path / "here").iterdir()} == {"results.json", "report.md", "report.html", "plot.svg"}
     refused(call("bench", "twin", "--only", "magic"), "'magic'", "effects")
     refused(call("bench", "twin", "--run", "nowhere"), "nowhere", "no finished fit")
 
@@ -144,7 +144,7 @@ def test_bench_render(tmp_path: Path) -> None:
     results = json.loads(result.stdout)
     assert results["out"] == "bench/render" and results["machine"]["threads"] == 1 and results["repeats"] == 1
     assert {row["method"].split(",")[0] for row in results["rows"]} == {"rgb", "pol", "all 2", "depth"}
-    assert {path.name for path in (tmp_path / "bench" / "render").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    assert {path.name for path in (tmp_path / "bench" / "render").iterdir()} == {"results.json", "report.md", "report.html", "plot.svg"}
     refused(call("bench", "render", "--only", "magic"), "'magic'", "termination")
     refused(call("bench", "render", "--run", "nowhere"), "nowhere", "no finished fit")
     refused(call("bench", "render", "--threads", "99999"), "--threads")
@@ -162,7 +162,7 @@ def test_bench_mesh(tmp_path: Path) -> None:
     for row in (usual, ours):
         assert row["resolution"] == 24 and row["seconds"] > 0 and row["peak_memory_bytes"] > 1e7
         assert row["against"]["accuracy"] < 0.27 / 24 and set(row["against"]["f_score"]) == {"0.01"}
-    assert {path.name for path in (tmp_path / "bench" / "mesh").iterdir()} == {"results.json", "report.md", "plot.svg"}
+    assert {path.name for path in (tmp_path / "bench" / "mesh").iterdir()} == {"results.json", "report.md", "report.html", "plot.svg"}
     refused(call("bench", "mesh", "run", "--methods", "magic"), "'magic'", "every block")
     refused(call("bench", "mesh", "nowhere"), "nowhere", "no finished fit")
     refused(call("bench", "mesh", "run", "--resolutions", "fine"), "fine", "128,256")

@@ -1,15 +1,18 @@
-"""The report is one file that says what was measured, with nothing fetched from anywhere."""
+"""The page of a run is one file that says what was measured and what the field makes of it, with nothing fetched from anywhere."""
 
 from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from analytic import AnalyticField, scene_of, sphere
+from analytic import AnalyticField, WrongField, scene_of, sphere
+from page_reader import check, picture_of
 
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
@@ -18,29 +21,126 @@ from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 
 
+class HalfPredicted(AnalyticField):
+    """No sensor measured its ms and pol: a prior says them, sure to a tenth."""
+
+    def __init__(self) -> None:
+        super().__init__(sphere())
+        self.predicted = ["pol", "ms"]
+        self.measured = ["rgb", "mono"]
+
+    def render(self, *args: Any, **how: Any) -> Any:
+        seen = super().render(*args, **how)
+        return replace(seen, deviation={name: 0.1 * seen.channels[name] for name in self.predicted if name in seen.channels})
+
+
+MANIFEST = {
+    "needs": {
+        "choices": {
+            "background": {"value": False, "why": "off: <nothing> there", "changed": False},
+            "tables": {"value": [15, 16.5], "why": "rows: enough", "changed": True},
+        },
+        "footprint": 0.01,
+    },
+    "seed": 7,
+    "seconds": {"fit": 60.5},
+}
+LOG = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
+
+
 def test_report(tmp_path: Path) -> None:
-    field = AnalyticField(sphere())
+    field = WrongField(sphere())
+    field.wrong = False
     scene = scene_of(field, tmp_path / "scene")
-    field.manifest = {
-        "needs": {"choices": {"background": {"value": False, "why": "off: <nothing> there", "changed": False}}, "footprint": 0.01},
-        "seed": 7,
-        "seconds": {"fit": 60.5},
-    }
-    log = [{"step": i, "elapsed": 1.0 * i, "loss": 1 / (i + 1), "psnr": {"rgb": 20.0 + i}} for i in range(5)]
+    field.wrong, field.manifest = True, MANIFEST
     evaluation = evaluate(field, scene)  # type: ignore[arg-type]
-    page = write_run_report(tmp_path, field, evaluation=evaluation, train_log=log, scene=scene).read_text()  # type: ignore[arg-type]
-    assert page.count("data:image/png;base64,") == 3 * 4 + 2 + 3  # frame, rendering, difference; polarization; geometry
-    assert (tmp_path / "preview.png").is_file()
-    assert "&lt;nothing&gt;" in page and "<nothing>" not in page
-    for text in ("PSNR [dB]", "spectral angle", "depth error", "60.5", "<svg", "Test views: 3."):
-        assert text in page
-    assert not re.search(r"<script|(?:src|href)=.https?:", page)
+    (tmp_path / "field.safetensors").write_bytes(b"0" * 2500)
+    (tmp_path / "mesh of it.ply").write_text("ply")
+    path = write_run_report(tmp_path, field, evaluation=evaluation, train_log=LOG, scene=scene)  # type: ignore[arg-type]
+    page = check(path)
+    assert "&lt;nothing&gt;" in page.source and "<nothing>" not in page.source
+    for text in ("PSNR [dB]", "spectral angle", "depth error", "<svg", "Test views: 3."):
+        assert text in page.source
+    assert page.table("what was decided and why") == [
+        ["choice", "value", "why"],
+        ["background", "off", "<nothing> there"],
+        ["tables", "15, 16.5", "rows: enough"],
+    ]
+    assert ["seconds.fit", "60.5"] in page.table("The run") and ["footprint", "0.01"] in page.table("What the scene needed")
+    assert [row[0] for row in page.table("PSNR of highlights, silhouettes and the rest")[1:]] == ["ms", "pol", "mono"]
+    links = {a.attributes["href"]: a.parent.whole_text() for a in page.root.all("ul", class_="files")[0].all("a") if a.parent is not None}
+    assert set(links) == {"field.safetensors", "mesh%20of%20it.ply", "preview.png"} and "2.5 kB" in links["field.safetensors"]
+    titles = [section.all("h3")[0].text for section in page.root.all("section", class_="modality")]
+    assert titles == ["rgb", "ms", "pol", "mono", "geometry"]
+    sections = dict(zip(titles, page.root.all("section", class_="modality"), strict=True))
+    assert {name: len(section.all("figure", class_="wipe")) for name, section in sections.items()} == {
+        "rgb": 1, "ms": 1, "pol": 3, "mono": 1, "geometry": 0
+    }  # fmt: skip
+    assert all(len(section.all("div", class_="strip")) == 1 for section in sections.values())
+
+
+def test_pictures_and_embedded_light_are_those_of_the_field_and_the_frame(tmp_path: Path) -> None:
+    field = WrongField(sphere())
+    field.wrong = False
+    scene = scene_of(field, tmp_path / "scene")
+    field.wrong = True
+    page = check(write_run_report(tmp_path, field, scene=scene))  # type: ignore[arg-type]
+    spectra = page.spectra()
+    assert set(spectra) == set(field.sensors)
+    errors = {}
+    for name, sensor in field.sensors.items():
+        (frame,) = scene.frames_of(name, (3,))
+        stored, ours, theirs = (
+            spectra[name],
+            field.render(frame.camera, frame.camera_to_world).channels[name],
+            measured_channels(sensor, frame),
+        )
+        assert stored["channels"] == list(sensor.channels) and stored["nm"] == list(sensor.wavelengths_nm) and stored["cell"] == [1.0, 1.0]
+        step = (stored["high"] - stored["low"]) / 65534
+        np.testing.assert_allclose(stored["rendered"], ours, atol=0.51 * step)
+        np.testing.assert_allclose(stored["measured"], theirs, atol=0.51 * step)
+        assert np.isfinite(ours).any() and np.abs(ours - theirs)[np.isfinite(ours)].max() > 0.02
+        errors[name] = np.abs(ours - theirs).mean(-1)
+    # one scale for all: a pixel is as bright as its error is large, whatever the modality
+    ends, seen = set(), []
+    for section in page.root.all("section", class_="modality"):
+        for image in section.all("img"):
+            if "map of the error" in image.attributes["alt"]:
+                assert image.parent is not None and image.parent.parent is not None
+                ends.add(image.parent.parent.all("span", class_="scale")[0].whole_text().strip())
+                error = errors[section.all("h3")[0].text]
+                where = np.isfinite(error)
+                seen.append(np.stack([error[where], picture_of(image).astype(float).mean(-1)[where]]))
+    (text,) = ends
+    found = re.fullmatch(r"0\s*([\d.]+) of full scale", text)
+    assert found is not None
+    error, brightness = np.concatenate(seen, 1)
+    high = float(found[1])
+    assert 0.5 * np.percentile(error, 99) < high < 3 * error.max()
+    order = np.argsort(error[error < high])
+    assert (np.diff(brightness[error < high][order]) >= -1.5).all() and brightness.max() - brightness.min() > 50
+
+
+def test_predicted_modalities_say_so_with_their_deviation(tmp_path: Path) -> None:
+    field = HalfPredicted()
+    scene = scene_of(field, tmp_path / "scene")
+    page = check(write_run_report(tmp_path, field, scene=scene))  # type: ignore[arg-type]
+    sections = {s.all("h3")[0].text.strip(): s for s in page.root.all("section", class_="modality")}
+    assert list(sections) == ["rgb", "mono", "pol", "ms", "geometry"]
+    assert [name for name, s in sections.items() if "predicted, not measured" in s.all("h3")[0].whole_text()] == ["pol", "ms"]
+    (frame,) = scene.frames_of("rgb", (3,))
+    stored = page.spectra()["ms"]
+    ours = field.render(frame.camera, frame.camera_to_world).channels["ms"]
+    assert "measured" not in stored
+    np.testing.assert_allclose(stored["rendered"], ours, atol=1e-5)
+    np.testing.assert_allclose(stored["deviation"], 0.1 * ours, atol=1e-5)
+    assert any("standard deviation" in image.attributes["alt"] for image in sections["ms"].all("img"))
 
 
 def test_report_of_a_bare_run(tmp_path: Path) -> None:
     """No scene, no scores, no log: still a page."""
-    page = write_run_report(tmp_path, AnalyticField(sphere())).read_text()  # type: ignore[arg-type]
-    assert "<h1>" in page and "<svg" not in page
+    page = check(write_run_report(tmp_path, AnalyticField(sphere())))  # type: ignore[arg-type]
+    assert not page.root.all("svg") and not page.root.all("img") and not (tmp_path / "preview.png").exists()
 
 
 def test_log(tmp_path: Path) -> None:
