@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 from pydantic import TypeAdapter
+from torch.nn.functional import pad
 
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field import kernels, rendering
-from mmsynth.field.field import Field
-from mmsynth.fitting import losses
+from mmsynth.field.field import MIRROR_CELLS, Field
+from mmsynth.field.light import Light
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.importance import Importance
@@ -100,6 +101,7 @@ class Trainer:
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
+        self.no_light = Light(self.field.appearance.width, self.field.shader.heads.out_features).to(self.device)
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
@@ -141,19 +143,16 @@ class Trainer:
         sampling = sampling_at(self.progress, self.recipe, self.needs)
         self._prepare(sampling, generator)
         batch = self._draw(random)
-        loss, squared, samples = self._loss(batch, sampling, generator)
-        if self.has_empty:
-            opacity, more = self._opacity_outside(random, sampling, generator)
-            loss, samples = loss + self.recipe.loss.alpha_weight * opacity.square().mean(), samples + more
-        wrong = self._differentiate(loss)
+        learned = self._learn(batch, sampling, random, generator)
+        wrong = self._wrong(learned.loss)
         if wrong is not None:
             self._skip(wrong)
             return
         self._update(sampling)
         keep = 0.98 if state.step else 0.0
-        value, before = float(loss.detach()), state.mean_loss
+        value, before, samples = float(learned.loss), state.mean_loss, int(learned.samples)
         state.mean_loss = value if math.isnan(before) else keep * before + (1 - keep) * value  # nan: all were skipped
-        for name, error in self._errors(batch, squared).items():
+        for name, error in self._errors(batch, learned.squared).items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(batch.origins)
         state.samples_total += samples
@@ -202,28 +201,23 @@ class Trainer:
         total = sum(self.needs.share.values())
         return {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
 
-    def _opacity_outside(
-        self, random: np.random.Generator, sampling: kernels.Sampling, generator: torch.Generator
-    ) -> tuple[torch.Tensor, int]:
-        """Opacity of some rays outside the object's masks, (R,), which should be 0, and the samples that it took. Their colours are
-        those of a background that is not the object's, or of a picture that was painted white there: they are not looked at."""
+    def _rays_outside(self, random: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Some rays outside the object's masks, (R, 3) each, whose opacity should be 0. Their colours are those of a background that is
+        not the object's, or of a picture that was painted white there: they are not looked at."""
         rays = {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}
-        origins, directions = draw_empty(self.measurements, rays, random, self.device)
-        jitter = torch.rand(len(origins), generator=generator).to(self.device)
-        field = self.field
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
-        return hits.opacity, int(hits.samples)
+        return draw_empty(self.measurements, rays, random, self.device)
 
-    def _differentiate(self, loss: torch.Tensor) -> str | None:
-        """Gradients of the loss; what is wrong where it or they are not finite, and then no gradient is left."""
-        if not bool(torch.isfinite(loss)):
-            return "the loss is not finite"
-        loss.backward()
+    def _wrong(self, loss: torch.Tensor) -> str | None:
+        """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
         # what is NaN in a sample is NaN in a sum
-        if not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
-            self.optimiser.clear()
-            return "a gradient is not finite"
-        return None
+        if not bool(torch.isfinite(loss)):
+            reason = "the loss is not finite"
+        elif not all(bool(torch.isfinite(p.grad.sum())) for p in self.networks if p.grad is not None):
+            reason = "a gradient is not finite"
+        else:
+            return None
+        self.optimiser.clear()
+        return reason
 
     def _update(self, sampling: kernels.Sampling) -> None:
         """A step of the optimiser, and of the mean over the last parameters."""
@@ -235,32 +229,61 @@ class Trainer:
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """The loss, the squared residual of each number (M,), and the samples that they took."""
-        recipe, field = self.recipe, self.field
-        jitter = torch.rand(len(batch.origins), generator=generator).to(self.device)
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-        degrees = batch.per_ray(field.view_dependence)
+    def _learn(
+        self, batch: Batch, sampling: kernels.Sampling, random: np.random.Generator, generator: torch.Generator
+    ) -> kernels.Learned:
+        """The loss of a batch; gradients are added to ``grad`` of all that is learned."""
+        field, origins, directions = self.field, batch.origins, batch.directions
+        if self.has_empty:
+            origins, directions = (torch.cat(pair) for pair in zip((origins, directions), self._rays_outside(random), strict=True))
+        count = len(origins)
+        near, far = rendering.interval(field.surface, origins, directions)
+        rays = kernels.Rays(origins, directions, near, far, torch.rand(count, generator=generator).to(self.device))
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
-        trains_geometry = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
-        gain = self._gain_of(batch)
+        trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
+        outside = count - len(trains)
+        view = kernels.View(*(pad(x, (0, outside), value=y) for x, y in ((batch.per_ray(field.view_dependence), 0), (trains, True))))
+        light = field.light if field.light is not None and field.shines else self.no_light
         # light from beyond the region would explain what is in it as long as that has no shape
-        shaded = field.with_far_light(hits) if self.state.decided is not None else hits
-        rays = kernels.ShadedRays(shaded.features, shaded.share, shaded.behind, batch.directions, degrees, trains_geometry)
-        light, slopes = self._mirrored(hits, batch, trains_geometry, sampling) if field.shines else (None, None)
-        loss, squared = kernels.compare(field.shader.weights(), rays, batch.measured, gain, light)
+        far_light = field.far_light if field.far_light is not None and self.state.decided is not None else origins.new_empty(0)
+        log_gain = self.log_gain if self._has_gains else origins.new_empty(0)
+        return kernels.learn(
+            *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
+            field.shader.weights(), light.network(), far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
+            self._opacities(batch, outside), self._eikonal(count, sampling, generator), sampling,
+        )  # fmt: skip
+
+    def _opacities(self, batch: Batch, outside: int) -> kernels.Opacities:
+        """What is known of the opacity of a batch's rays, and that so many rays behind them meet nothing."""
+        recipe, rays, none = self.recipe.loss, len(batch.origins), batch.ray_weight.new_zeros
+        if not (self.has_opacity or self.needs.black_background):
+            return kernels.Opacities(none(0), none(0), none(0))
+        target, weight, linear = none(rays + outside), none(rays + outside), none(rays + outside)
+        weight[rays:] = recipe.alpha_weight / max(outside, 1)
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)
-            off = batch.ray_weight * (hits.opacity - batch.alpha).square()
-            loss = loss + recipe.loss.alpha_weight * off[known].sum() / len(jitter)
-        elif self.needs.black_background:
+            target[:rays] = torch.where(known, batch.alpha, target[:rays])
+            weight[:rays] = recipe.alpha_weight / rays * batch.ray_weight * known
+        else:
             m = batch.measured
-            black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
-            loss = loss + recipe.loss.background_opacity_weight * (batch.ray_weight * hits.opacity * black).mean()
-        if recipe.loss.eikonal_weight > 0:
-            found = self._gradients(hits, batch, slopes, sampling, generator)
-            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(*found)
-        return loss, squared, int(hits.samples)
+            black = none(rays).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
+            linear[:rays] = recipe.background_opacity_weight / rays * batch.ray_weight * black
+        return kernels.Opacities(target, weight, linear)
+
+    def _eikonal(self, rays: int, sampling: kernels.Sampling, generator: torch.Generator) -> kernels.Eikonal:
+        """Where the distance is pulled towards a true one: a quarter of the points in all space, the others within the soft surface, or at
+        all surfaces that rays meet where these shine, whose normals are known."""
+        grid, recipe = self.field.surface.grid, self.recipe
+        count = recipe.loss.eikonal_points if recipe.loss.eikonal_weight > 0 else 0
+        points = (torch.rand(count // 4, 3, generator=generator) * 2 - 1) * grid.extent
+        near = 0 if self.field.shines else count - len(points)
+        noise = torch.randn(near, 3, generator=generator) * (3.0 / sampling.sharpness)
+        cell = grid.cell(sampling.active_surface)
+        # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
+        shallow = recipe.loss.eikonal_shallow_early if self.progress < recipe.schedule.levels_until else 1.0
+        return kernels.Eikonal(
+            points.to(self.device), noise.to(self.device), recipe.loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow
+        )
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
@@ -301,40 +324,6 @@ class Trainer:
 
     def _see_directions(self, decisions: Decisions) -> None:
         self.field.view_dependence.update({name: choice.value for name, choice in decisions.view_dependence.items()})
-
-    def _mirrored(
-        self, hits: kernels.Hits, batch: Batch, trains_geometry: torch.Tensor, sampling: kernels.Sampling
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mirrored light in each number, (M,), and ∇sdf at the surfaces that mirror it."""
-        light = self.field.light
-        assert light is not None
-        mirrors, slopes = self.field.mirrors(hits, batch.origins, batch.directions, sampling.active_surface)
-        if self.needs.sparse:
-            trains = trains_geometry[kernels.rays_of(hits.behind)]
-            kept = lambda x: torch.where(trains if x.dim() == 1 else trains[:, None], x, x.detach())
-            mirrors = mirrors._replace(material=kept(mirrors.material), normals=kept(mirrors.normals), share=kept(mirrors.share))
-        return kernels.mirror(light.lamps(), mirrors, hits.behind, batch.measured), slopes[hits.distance > 0]
-
-    def _gradients(
-        self, hits: kernels.Hits, batch: Batch, slopes: torch.Tensor | None, sampling: kernels.Sampling, generator: torch.Generator
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """∇sdf at some points of all space, and at what was hit: ``slopes`` where they are known, else around some of the hits, within
-        the soft surface; and the factors where it is below 1."""
-        count = self.recipe.loss.eikonal_points
-        surface = self.field.surface
-        points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * surface.grid.extent).to(self.device)]
-        hit = torch.nonzero(torch.isfinite(hits.depth))[:, 0]
-        if slopes is None and len(hit):
-            chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
-            noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
-            met = batch.origins[chosen] + batch.directions[chosen] * hits.depth[chosen, None]
-            points.append(surface.grid.to_grid(met) + noise)
-        at = torch.cat(points)
-        found, shallow = surface.gradient(at, surface.grid.cell(sampling.active_surface), sampling.active_surface), at.new_ones(len(at))
-        if self.progress < self.recipe.schedule.levels_until:
-            # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
-            shallow[torch.linalg.vector_norm(at, dim=-1) < 1.0] = self.recipe.loss.eikonal_shallow_early
-        return (found, shallow) if slopes is None else (torch.cat([found, slopes]), torch.cat([shallow, at.new_ones(len(slopes))]))
 
     def _skip(self, reason: str) -> None:
         self.state.step += 1

@@ -32,7 +32,7 @@ from mmsynth.field.kernels.constants import (
 )
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
 
-CHUNK = 256  # rays
+CHUNK = 128  # rays
 LANES = 64
 _LONGEST_STEP = np.float32(LONGEST_STEP)
 _LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
