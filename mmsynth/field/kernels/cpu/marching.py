@@ -30,10 +30,12 @@ from mmsynth.field.kernels.constants import (
     SOFT_SURFACE,
     SOLID,
 )
-from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
+from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, encode_block, padded_output, surface_block
+from mmsynth.field.kernels.cpu.matrices import padded_to
 
 CHUNK = 128  # rays
 LANES = 64
+CAPACITY = CHUNK * MAX_SAMPLES_PER_RAY + 8  # samples of a chunk, and room for whole tiles
 _LONGEST_STEP = np.float32(LONGEST_STEP)
 _LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
@@ -115,25 +117,14 @@ def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _to_rows(block, n):  # type: ignore[no-untyped-def]
-    """x y z x y z ... → a row of x, of y, of z."""
-    copy = block[: 3 * n].copy()
-    for i in range(n):
-        block[i] = copy[3 * i]
-        block[n + i] = copy[3 * i + 1]
-        block[2 * n + i] = copy[3 * i + 2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def march_rays(begin, count, slot, rays, states, sampling, grid, network, store):  # type: ignore[no-untyped-def]
+def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):  # type: ignore[no-untyped-def]
     """Samples of the rays of a chunk and their distances, see ``reference.march``: how many."""
-    size = FIRST_FEATURE_ROW + FEATURES * grid.resolutions.shape[0]
-    units = network.hidden.shape[0]
     contracted = grid.extent > np.float32(1.0)
     sharpness, step, factor = sampling.sharpness, np.float32(sampling.step), np.float32(sampling.sphere_step_factor)
     min_slope = np.float32(sampling.min_slope)
     origins, directions = rays.origins, rays.directions
     t_of, f_of, p_of, counts = store.t_of, store.f_of, store.p_of, store.counts
+    block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
     # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
     where = np.empty(CHUNK, np.float32)
     tau_of = np.empty(CHUNK, np.float64)
@@ -143,11 +134,9 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, network, store)
     lanes = np.empty(LANES, np.int32)
     going = 0
     waiting = 0
-    used = 0
-    blocks = 0
+    used = np.int64(0)
     while going > 0 or waiting < count:
         n = np.int64(0)
-        f = store.block[slot, used * size :]
         taken = 0
         while n < LANES and (taken < going or waiting < count):
             if taken < going:
@@ -169,20 +158,16 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, network, store)
             where[i] = t
             speed_of[i], reach_of[i], state_of[i] = speed, r, state
             lanes[n] = i
-            # rows are laid out once n is known
-            f[3 * n], f[3 * n + 1], f[3 * n + 2] = x, y, z
+            block[used + n, 0], block[used + n, 1], block[used + n, 2], block[used + n, 3] = x, y, z, np.float32(1.0)
             n += 1
         if n == 0:
             break
-        _to_rows(f, n)
-        for i in range(3 * n, 4 * n):
-            f[i] = np.float32(1.0)
-        surface_block(f, store.hidden[slot, used * units :], store.sdf[slot, used : used + n], n, grid, network)
+        surface_block(block[used:], hidden[used:], sdf[used:], n, grid, layers)
         going = 0
         for a in range(n):
             i = lanes[a]
             k = counts[slot, i]
-            value = store.sdf[slot, used + a]
+            value = sdf[used + a]
             t = where[i]
             here = i * MAX_SAMPLES_PER_RAY + k
             t_of[slot, here] = t
@@ -208,10 +193,8 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, network, store)
             where[i] = t + jump
             lanes[going] = i
             going += 1
-        store.sizes[slot, blocks] = n
-        blocks += 1
-        used += int(n)
-    store.rounds[slot, 0] = blocks
+        used += n
+    store.samples[slot, 0] = used
     return used
 
 
@@ -260,14 +243,12 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
                     if contracted:
                         x, y, z, _ = contract(x, y, z)
                     if sections > first and nearest < 0.0:
-                        last = 3 * (sections - 1)
-                        dx, dy, dz = x - s_block[slot, last], y - s_block[slot, last + 1], z - s_block[slot, last + 2]
+                        last = sections - 1
+                        dx, dy, dz = x - s_block[slot, last, 0], y - s_block[slot, last, 1], z - s_block[slot, last, 2]
                         if math.sqrt(dx * dx + dy * dy + dz * dz) > gap:
                             nearest = before
                             store.second[slot, i] = k
-                    s_block[slot, 3 * sections] = x
-                    s_block[slot, 3 * sections + 1] = y
-                    s_block[slot, 3 * sections + 2] = z
+                    s_block[slot, sections, 0], s_block[slot, sections, 1], s_block[slot, sections, 2] = x, y, z
                     store.s_ray[slot, sections] = i
                     store.s_k[slot, sections] = k
                     store.s_time[slot, sections] = t
@@ -283,9 +264,8 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
 @njit(cache=True, nogil=True, error_model="numpy")
 def composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
     """Features and distance of a chunk's rays: the mean over the sections of each surface, (2, R, F) and (2, R)."""
-    s_block, width = store.s_block, FEATURES * appearance.active
-    _to_rows(s_block[slot], sections)
-    encode_block(s_block[slot], sections, appearance, 3)
+    s_block, width = store.s_block[slot], FEATURES * appearance.active
+    encode_block(s_block, sections, appearance)
     shown[:, begin : begin + count] = np.float32(0.0)
     features[:, begin : begin + count] = np.float32(0.0)
     distance[:, begin : begin + count] = np.float32(0.0)
@@ -296,7 +276,7 @@ def composite(begin, count, slot, sections, appearance, store, features, distanc
         shown[which, begin + i] += w
         distance[which, begin + i] += w * store.s_time[slot, s]
         for j in range(width):
-            features[which, begin + i, j] += w * s_block[slot, (3 + j) * sections + s]
+            features[which, begin + i, j] += w * s_block[s, FIRST_FEATURE_ROW + j]
     for i in range(count):
         for which in range(2 if store.second[slot, i] < MAX_SAMPLES_PER_RAY else 1):
             scale = np.float32(1.0) / max(shown[which, begin + i], _LEAST_WEIGHT)
@@ -309,11 +289,16 @@ def composite(begin, count, slot, sections, appearance, store, features, distanc
 def trace_forward(rays, states, sampling, grid, network, appearance, keep, store, out):  # type: ignore[no-untyped-def]
     """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
     total, samples = rays.origins.shape[0], out.samples  # in a parallel loop, numba would not set a tuple's arrays
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    layers = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         slot = np.int64(chunk) if keep else np.int64(get_thread_id())
         begin = np.int64(chunk) * CHUNK
         count = min(CHUNK, total - begin)
-        samples[chunk] = march_rays(begin, count, slot, rays, states, sampling, grid, network, store)
+        samples[chunk] = march_rays(begin, count, slot, rays, states, sampling, grid, layers, store)
         contracted = grid.extent > np.float32(1.0)
         sections = find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
         composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)

@@ -8,22 +8,28 @@ import numpy as np
 from numba import njit, prange
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, MAX_SAMPLES_PER_RAY
-from mmsynth.field.kernels.cpu.blocks import position_block, scatter_block, surface_block_backward, surface_block_positions
+from mmsynth.field.kernels.cpu.blocks import (
+    SurfaceLayers,
+    padded_output,
+    position_block,
+    scatter_block,
+    surface_block_backward,
+    surface_block_positions,
+)
 from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
+from mmsynth.field.kernels.cpu.matrices import padded_to
 
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rays_backward(  # type: ignore[no-untyped-def]
-    begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, active, network, a_active, store
+    begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
     """``trace_backward`` of the rays of a chunk, of which ``begin`` is the first in ``behind``."""
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
-    units = network.hidden.shape[0]
     sdf, p_of, id_of = store.sdf, store.p_of, store.id_of
-    hidden_out, output_out = store.hidden_out, store.output_out
-    hidden_out[chunk] = np.float32(0.0)
+    turned_out, output_out, block, hidden = store.turned_out, store.output_out, store.block[chunk], store.hidden[chunk]
+    turned_out[chunk] = np.float32(0.0)
     output_out[chunk] = np.float32(0.0)
     sections = store.s_count[chunk, 0]
     sf = store.s_block[chunk]
@@ -41,10 +47,9 @@ def rays_backward(  # type: ignore[no-untyped-def]
             g = g_weight[row]
             w = store.s_weight[chunk, at] * scale
             for j in range(FEATURES * a_active):
-                place = (3 + j) * sections + at
                 gf = g_features[row, j]
-                g += gf * scale * (sf[place] - features[row, j])
-                sf[place] = gf * w
+                g += gf * scale * (sf[at, FIRST_FEATURE_ROW + j] - features[row, j])
+                sf[at, FIRST_FEATURE_ROW + j] = gf * w
             g_section[store.s_k[chunk, at]] = g
             at += 1
         # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
@@ -66,14 +71,13 @@ def rays_backward(  # type: ignore[no-untyped-def]
                 sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] += np.float32(d_tau * sharpness * -math.expm1(-p0))
                 sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]] -= np.float32(d_tau * sharpness * -math.expm1(-p1))
                 tau_sum += tau
-    used = 0
-    for b in range(store.rounds[chunk, 0]):
-        n = np.int64(store.sizes[chunk, b])
+    used, samples = np.int64(0), np.int64(store.samples[chunk, 0])
+    while used < samples:
+        n = np.int64(min(LANES, samples - used))
         surface_block_backward(
-            store.block[chunk, used * size :], store.hidden[chunk, used * units :], sdf[chunk, used : used + n], n,
-            active, network, store.row[chunk], hidden_out[chunk], output_out[chunk],
-        )  # fmt: skip
-        used += int(n)
+            block[used:], hidden[used:], sdf[chunk, used:], n, active, layers, turned_out[chunk], output_out[chunk]
+        )
+        used += n
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -85,32 +89,36 @@ def trace_backward(  # type: ignore[no-untyped-def]
     behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
     """
     rays = behind.shape[0]
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    layers = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
     for task in prange((rays + CHUNK - 1) // CHUNK):
         chunk = np.int64(task)
         begin = chunk * CHUNK
         rays_backward(
-            begin, min(CHUNK, rays - begin), chunk, behind, g_features, g_weight, features, shown, sharpness, active, network, a_active,
+            begin, min(CHUNK, rays - begin), chunk, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active,
             store,
         )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_level(task, chunks, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
+    """The gradient of a level of the surface's table or, after these, of the appearance's."""
+    for chunk in range(chunks):
+        if task < grid.active:
+            scatter_block(store.block[chunk], np.int64(store.samples[chunk, 0]), grid, gradient, task)
+        else:
+            scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def trace_scatter(rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
     chunks = (rays + CHUNK - 1) // CHUNK
     for each in prange(grid.active + appearance.active):
-        task = np.int64(each)
-        if task < grid.active:
-            for chunk in range(chunks):
-                used = 0
-                for b in range(store.rounds[chunk, 0]):
-                    n = np.int64(store.sizes[chunk, b])
-                    scatter_block(store.block[chunk, used * size :], n, grid, gradient, task, FIRST_FEATURE_ROW)
-                    used += int(n)
-        else:
-            for chunk in range(chunks):
-                scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active, 3)
+        add_level(np.int64(each), chunks, grid, appearance, store, gradient, a_gradient)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -128,8 +136,11 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
 def trace_rays_backward(origins, directions, grid, network, appearance, store, origins_out, directions_out):  # type: ignore[no-untyped-def]
     """After ``trace_backward``: gradients to origins and directions, with the samples' ray distances held fixed."""
     rays = origins.shape[0]
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
-    units = network.hidden.shape[0]
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    layers = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
     contracted = grid.extent > np.float32(1.0)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(chunk) * CHUNK
@@ -137,26 +148,21 @@ def trace_rays_backward(origins, directions, grid, network, appearance, store, o
             for a in range(3):
                 origins_out[o, a] = np.float32(0.0)
                 directions_out[o, a] = np.float32(0.0)
-        used = 0
-        sections = store.s_count[chunk, 0]
-        out = np.zeros(3 * max(np.int64(LANES), np.int64(sections)), np.float32)
-        for b in range(store.rounds[chunk, 0] + 1):
-            last = b == store.rounds[chunk, 0]
-            n = np.int64(sections if last else store.sizes[chunk, b])
+        samples, sections = np.int64(store.samples[chunk, 0]), np.int64(store.s_count[chunk, 0])
+        out = np.zeros((max(samples, sections), 3), np.float32)
+        for last in (False, True):
+            n = sections if last else samples
             if last:
-                out[: 3 * n] = np.float32(0.0)
-                position_block(store.s_block[chunk], n, appearance, 3, out)
+                out[:n] = np.float32(0.0)
+                position_block(store.s_block[chunk], n, appearance, out)
             else:
-                surface_block_positions(
-                    store.block[chunk, used * size :], store.hidden[chunk, used * units :], store.sdf[chunk, used : used + n], n,
-                    grid, network, out,
-                )  # fmt: skip
+                surface_block_positions(store.block[chunk], store.hidden[chunk], store.sdf[chunk], n, grid, layers, out)
             for i in range(n):
-                o = begin + (store.s_ray[chunk, i] if last else store.ray_of[chunk, used + i])
-                t = store.s_time[chunk, i] if last else store.time_of[chunk, used + i]
+                o = begin + (store.s_ray[chunk, i] if last else store.ray_of[chunk, i])
+                t = store.s_time[chunk, i] if last else store.time_of[chunk, i]
                 gx, gy, gz = _back_to_world(
                     origins[o, 0] + directions[o, 0] * t, origins[o, 1] + directions[o, 1] * t, origins[o, 2] + directions[o, 2] * t,
-                    out[i], out[n + i], out[2 * n + i], contracted,
+                    out[i, 0], out[i, 1], out[i, 2], contracted,
                 )  # fmt: skip
                 origins_out[o, 0] += gx
                 origins_out[o, 1] += gy
@@ -164,5 +170,3 @@ def trace_rays_backward(origins, directions, grid, network, appearance, store, o
                 directions_out[o, 0] += t * gx
                 directions_out[o, 1] += t * gy
                 directions_out[o, 2] += t * gz
-            if not last:
-                used += int(n)
