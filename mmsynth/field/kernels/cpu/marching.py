@@ -32,6 +32,7 @@ from mmsynth.field.kernels.constants import (
 )
 from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, encode_block, padded_output, surface_block
 from mmsynth.field.kernels.cpu.matrices import padded_to
+from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
 
 CHUNK = 128  # rays
 LANES = 64
@@ -41,13 +42,6 @@ _LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 _NO_CROSSING = np.float32(NO_CROSSING)
 _FACE_OVERSHOOT = np.float32(FACE_OVERSHOOT)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _softplus(x):  # type: ignore[no-untyped-def]
-    if abs(x) > 40.0:  # exp(-40) is below the rounding of 1
-        return max(x, 0.0)
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -80,13 +74,22 @@ def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contr
     skipped = False
     while t < far:
         x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-        r = np.float32(0.0)
+        cx, cy, cz, vx, vy, vz, r, speed = x, y, z, dx, dy, dz, np.float32(1.0), np.float32(1.0)
         if contracted:
-            cx, cy, cz, r = contract(x, y, z)
-            vx, vy, vz = velocity(x, y, z, r, dx, dy, dz)
-        else:
-            cx, cy, cz, vx, vy, vz = x, y, z, dx, dy, dz
-        speed = np.float32(math.sqrt(vx * vx + vy * vy + vz * vz))
+            square = x * x + y * y + z * z
+            if square > np.float32(1.0):  # ``contract`` and ``velocity`` at once, of a direction of unit length
+                r = np.float32(math.sqrt(square))
+                inverse = np.float32(1.0) / r
+                k = (np.float32(2.0) - inverse) * inverse
+                along = (x * dx + y * dy + z * dz) * inverse
+                radial = along * (inverse * inverse - k) * inverse
+                cx, cy, cz = x * k, y * k, z * k
+                vx, vy, vz = dx * k + x * radial, dy * k + y * radial, dz * k + z * radial
+                # from the parts along the radius and across it: 1 - along² would be rounding alone far away
+                along *= inverse
+                px, py, pz = dx - x * along, dy - y * along, dz - z * along
+                outward = along * inverse
+                speed = np.float32(math.sqrt(k * k * (px * px + py * py + pz * pz) + outward * outward))
         ix = min(max(int((cx + extent) * half), 0), grid - 1)
         iy = min(max(int((cy + extent) * half), 0), grid - 1)
         iz = min(max(int((cz + extent) * half), 0), grid - 1)
@@ -123,7 +126,8 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     sharpness, step, factor = sampling.sharpness, np.float32(sampling.step), np.float32(sampling.sphere_step_factor)
     min_slope = np.float32(sampling.min_slope)
     origins, directions = rays.origins, rays.directions
-    t_of, f_of, p_of, counts = store.t_of, store.f_of, store.p_of, store.counts
+    t_of, f_of, p_of, q_of, counts = store.t_of, store.f_of, store.p_of, store.q_of, store.counts
+    depths, densities = np.empty(LANES, np.float64), np.empty(LANES, np.float64)
     block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
     # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
     where = np.empty(CHUNK, np.float32)
@@ -163,6 +167,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
         if n == 0:
             break
         surface_block(block[used:], hidden[used:], sdf[used:], n, grid, layers)
+        negative_log_cdf(sdf[used:], n, sharpness, depths, densities)
         going = 0
         for a in range(n):
             i = lanes[a]
@@ -172,7 +177,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
             here = i * MAX_SAMPLES_PER_RAY + k
             t_of[slot, here] = t
             f_of[slot, here] = value
-            p_of[slot, here] = _softplus(-sharpness * np.float64(value))
+            p_of[slot, here], q_of[slot, here] = depths[a], densities[a]
             store.id_of[slot, here] = used + a
             store.ray_of[slot, used + a] = i
             store.time_of[slot, used + a] = t
@@ -211,7 +216,7 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
     gap = np.float32(LAYER_GAP / sampling.sharpness)
     for i in range(count):
         o = begin + i
-        tau_sum = 0.0
+        tau_sum, transmittance = 0.0, 1.0
         before = 0.0
         nearest = -1.0  # the weight of the nearest surface, once there is a second
         first = sections
@@ -220,14 +225,18 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
         for k in range(store.counts[slot, i] - 1):
             here = i * MAX_SAMPLES_PER_RAY + k
             tau = p_of[slot, here + 1] - p_of[slot, here]
+            store.opacity_of[slot, here] = 0.0
             if tau < 1e-7:
                 continue
             f0 = f_of[slot, here]
             f1 = f_of[slot, here + 1]
-            w = math.exp(-tau_sum) * -math.expm1(-tau)
+            opacity = -math.expm1(-tau)
+            store.opacity_of[slot, here] = opacity
+            w = transmittance * opacity
+            transmittance -= w
             tau_sum += tau
             if tau_sum > sampling.max_optical_depth:  # the ray was ended here: what is left belongs to this surface, too
-                w += math.exp(-tau_sum)
+                w += transmittance
             if w > min_weight or (before < 0.5 and before + w >= 0.5):
                 crossing = np.float32(0.5)
                 if f0 > 0 and f1 <= 0:

@@ -31,7 +31,7 @@ class SurfaceStore(NamedTuple):
 
 class RayStore(NamedTuple):
     """Of rays. Per sample, in the order of the blocks: block, hidden, sdf, ray_of, time_of. Per ray and number of the sample
-    (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), id_of (place in the order of the blocks); counts: samples
+    (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), q_of (minus its slope over s), opacity_of (of the section that begins there), id_of (place in the order of the blocks); counts: samples
     of each ray; second: the sample at which its second surface begins; samples: of all. Sections that matter: s_block (a block, too), s_ray,
     s_k (its first sample), s_time, s_weight, s_count. The weights' gradients."""
 
@@ -43,6 +43,8 @@ class RayStore(NamedTuple):
     t_of: np.ndarray
     f_of: np.ndarray
     p_of: np.ndarray
+    q_of: np.ndarray
+    opacity_of: np.ndarray
     id_of: np.ndarray
     counts: np.ndarray
     second: np.ndarray
@@ -115,7 +117,7 @@ def ray_store(slots: int, units: int, levels: int, appearance_levels: int) -> St
     """The same, of rays with an appearance."""
     f, i, d, most = np.float32, np.int32, np.float64, CAPACITY
     lengths: dict[str, tuple[type, int]] = {
-        "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most), "t_of": (f, most), "f_of": (f, most), "p_of": (d, most),
+        "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most), "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "q_of": (d, most), "opacity_of": (d, most),
         "id_of": (i, most), "counts": (i, CHUNK), "second": (i, CHUNK), "samples": (i, 1), "s_ray": (i, most), "s_k": (i, most),
         "s_time": (f, most), "s_weight": (f, most), "s_count": (i, 1),
     }  # fmt: skip

@@ -27,7 +27,7 @@ def rays_backward(  # type: ignore[no-untyped-def]
     begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
     """``trace_backward`` of the rays of a chunk, of which ``begin`` is the first in ``behind``."""
-    sdf, p_of, id_of = store.sdf, store.p_of, store.id_of
+    sdf, q_of, opacity_of, id_of = store.sdf, store.q_of, store.opacity_of, store.id_of
     turned_out, output_out, block, hidden = store.turned_out, store.output_out, store.block[chunk], store.hidden[chunk]
     turned_out[chunk] = np.float32(0.0)
     output_out[chunk] = np.float32(0.0)
@@ -53,24 +53,23 @@ def rays_backward(  # type: ignore[no-untyped-def]
             g_section[store.s_k[chunk, at]] = g
             at += 1
         # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
-        tau_sum = 0.0
-        total = 0.0
+        first = i * MAX_SAMPLES_PER_RAY
+        total, transmittance = 0.0, 1.0
         for k in range(samples - 1):
-            tau = max(0.0, p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1] - p_of[chunk, i * MAX_SAMPLES_PER_RAY + k])
-            total += g_section[k] * math.exp(-tau_sum) * -math.expm1(-tau)
-            tau_sum += tau
-        tau_sum = 0.0
+            w = transmittance * opacity_of[chunk, first + k]
+            total += g_section[k] * w
+            transmittance -= w
+        transmittance = 1.0
         for k in range(samples - 1):
-            p0, p1 = p_of[chunk, i * MAX_SAMPLES_PER_RAY + k], p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]
-            tau = p1 - p0
-            if tau > 1e-7:
-                transmittance = math.exp(-tau_sum)
-                total -= g_section[k] * transmittance * -math.expm1(-tau)
+            opacity = opacity_of[chunk, first + k]
+            if opacity > 0.0:
+                w = transmittance * opacity
+                total -= g_section[k] * w
+                transmittance -= w
                 # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
-                d_tau = g_section[k] * transmittance * math.exp(-tau) - total
-                sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] += np.float32(d_tau * sharpness * -math.expm1(-p0))
-                sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]] -= np.float32(d_tau * sharpness * -math.expm1(-p1))
-                tau_sum += tau
+                d_tau = (g_section[k] * transmittance - total) * sharpness
+                sdf[chunk, id_of[chunk, first + k]] += np.float32(d_tau * q_of[chunk, first + k])
+                sdf[chunk, id_of[chunk, first + k + 1]] -= np.float32(d_tau * q_of[chunk, first + k + 1])
     used, samples = np.int64(0), np.int64(store.samples[chunk, 0])
     while used < samples:
         n = np.int64(min(LANES, samples - used))
