@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from mmsynth.field.kernels.constants import LEAST_WEIGHT
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT
 from mmsynth.field.kernels.cpu import mirroring, shading
 from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, padded_output, scatter_block, surface_block, surface_block_backward
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, contract, find_sections, march_rays, velocity
@@ -20,7 +20,7 @@ from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
 from mmsynth.field.kernels.cpu.shading import Layers, clear_gradients, compare_rays, first_at, layer, layer_backward
 from mmsynth.field.kernels.cpu.tasks import take
-from mmsynth.field.kernels.cpu.tracing_gradients import add_level, rays_backward
+from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
 from mmsynth.field.kernels.learning import TAPS
 from mmsynth.field.kernels.parameters import Mirrors, Rays, ShadedRays
 
@@ -34,12 +34,23 @@ _LEAST_WEIGHT, _TINY = _f(LEAST_WEIGHT), _f(1e-12)
 
 
 class TapStore(NamedTuple):
-    """Of points at which the surface's gradient is asked for, a slot per chunk: block, hidden (see ``blocks``), four rows a point; used: rows;
-    the weights' gradients."""
+    """Of points at which the surface's gradient is asked for, a slot per chunk: block (see ``blocks``), four rows a point; used: rows; the
+    weights' gradients."""
 
     block: np.ndarray
-    hidden: np.ndarray
     used: np.ndarray
+    turned_out: np.ndarray
+    output_out: np.ndarray
+
+
+class TableStore(NamedTuple):
+    """What tables learn from, a slot per chunk of rays: of the samples that have a gradient, their rows (see ``blocks``), and of the sections;
+    how many; the gradients of the surface's weights."""
+
+    block: np.ndarray
+    samples: np.ndarray
+    s_block: np.ndarray
+    sections: np.ndarray
     turned_out: np.ndarray
     output_out: np.ndarray
 
@@ -47,6 +58,7 @@ class TapStore(NamedTuple):
 class ChunkScratch(NamedTuple):
     """Of the rays of a chunk, a slot per thread. Rows: ``CHUNK`` surfaces nearest to the cameras, and ``CHUNK`` behind them."""
 
+    hidden: np.ndarray  # of the taps: a row for each of ``TapStore``
     features: np.ndarray  # (2, CHUNK, F)
     weight: np.ndarray  # (2, CHUNK)
     distance: np.ndarray
@@ -102,7 +114,7 @@ class LightLayers(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slopes(at, n, epsilon, grid, surface, taps, slot, found):  # type: ignore[no-untyped-def]
+def _slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: ignore[no-untyped-def]
     """See ``learning.surface_gradient``: of n points ``at`` (n, 3), whose taps are kept in the slot of ``taps`` behind what is there."""
     move, scale = epsilon / _f(math.sqrt(3.0)), _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
     values = np.empty(4 * TAPPED, np.float32)
@@ -115,7 +127,7 @@ def _slopes(at, n, epsilon, grid, surface, taps, slot, found):  # type: ignore[n
                 for a in range(3):
                     block[row, a] = at[begin + i, a] + move * _TAPS[t, a]
                 block[row, 3] = _ONE
-        surface_block(block, taps.hidden[slot, used:], values, 4 * count, grid, surface)
+        surface_block(block, hidden[used:], values, 4 * count, grid, surface)
         for i in range(count):
             for a in range(3):
                 total = _ZERO
@@ -126,7 +138,7 @@ def _slopes(at, n, epsilon, grid, surface, taps, slot, found):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slopes_backward(g, n, epsilon, grid, surface, taps, slot, first):  # type: ignore[no-untyped-def]
+def _slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  # type: ignore[no-untyped-def]
     """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
     scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
     values = np.empty(4 * TAPPED, np.float32)
@@ -139,7 +151,7 @@ def _slopes_backward(g, n, epsilon, grid, surface, taps, slot, first):  # type: 
                     total += g[begin + i, a] * _TAPS[t, a]
                 values[4 * i + t] = total * scale
         surface_block_backward(
-            taps.block[slot, used:], taps.hidden[slot, used:], values, 4 * count, grid.active, surface, taps.turned_out[slot],
+            taps.block[slot, used:], hidden[used:], values, 4 * count, grid.active, surface, taps.turned_out[slot],
             taps.output_out[slot],
         )  # fmt: skip
 
@@ -167,11 +179,11 @@ def _learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, s
     at, found = points[begin : begin + count], scratch.found[slot]
     taps.used[chunk, 0] = 0
     taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
-    _slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, found)
+    _slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
     loss, g = 0.0, np.zeros((count, 3), np.float32)
     for i in range(count):
         loss += _pull(found[i], factor, eikonal.shallow if _is_within(at[i]) else _ONE, g[i])
-    _slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, 0)
+    _slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
     return loss
 
 
@@ -217,7 +229,7 @@ def _mix_backward(count, far_light, features, share, opacity, behind, mixed_shar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _see_mirrors(begin, count, ray0, rays, trace, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, epsilon, mirrored):  # type: ignore[no-untyped-def]
+def _see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, epsilon, mirrored):  # type: ignore[no-untyped-def]
     """Surfaces of some rays as mirrors: points, slopes, normals, material, and the light that they mirror. Blocks are added to ``taps``."""
     s, behind = scratch, scratch.behind[slot]
     material, normals, points, directions = s.material[slot], s.normals[slot], s.points[slot], s.directions[slot]
@@ -244,7 +256,7 @@ def _see_mirrors(begin, count, ray0, rays, trace, taps, lamps, light, measured, 
                 at[n, 0], at[n, 1], at[n, 2] = px, py, pz
                 row_of[n] = row
                 n += 1
-    _slopes(at, n, epsilon, grid, surface, taps, chunk, found)
+    _slopes(at, n, epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
     clear(x, whole(n, TILE_ROWS), x.shape[1])
     for i in range(n):
         row = row_of[i]
@@ -307,7 +319,7 @@ def _mirrors_backward(  # type: ignore[no-untyped-def]
                 gx, gy_, gz = velocity(px, py, pz, r, gx, gy_, gz)
             at[i, 0], at[i, 1], at[i, 2] = gx, gy_, gz
         loss += _pull(found[i], factor, _ONE, at[i])
-    _slopes_backward(at, n, eikonal.mirror_epsilon, grid, surface, taps, chunk, first)
+    _slopes_backward(at, n, eikonal.mirror_epsilon, grid, surface, taps, chunk, scratch.hidden[slot], first)
     add_product(gy.T, h, out.second[chunk], gy.shape[1], n, h.shape[1])
     clear(gh, rows, gh.shape[1])
     add_product(gy, light.second, gh, rows, gy.shape[1], gh.shape[1])
@@ -327,7 +339,7 @@ def _mirrors_backward(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _learn_rays(  # type: ignore[no-untyped-def]
     chunk, slot, begin, count, total, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light,
-    view, measured, gain, opacities, eikonal, asked, store, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """All of a chunk of rays, of which ``begin`` is the first: its loss."""
     s, sharpness = scratch, sampling.sharpness
@@ -336,9 +348,9 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     features, weight, distance, shown, depth = s.features[slot], s.weight[slot], s.distance[slot], s.shown[slot], s.depth[slot]
     behind, g_features, g_share = s.behind[slot], s.g_features[slot], s.g_share[slot]
     wide = grid.extent > _ONE
-    samples[chunk] = march_rays(0, count, chunk, here, states, sampling, grid, surface, store)
-    sections = find_sections(0, count, chunk, here, wide, sampling, store, weight, depth)
-    composite(0, count, chunk, sections, appearance, store, features, distance, shown)
+    samples[chunk] = march_rays(0, count, slot, here, states, sampling, grid, surface, store)
+    sections = find_sections(0, count, slot, here, wide, sampling, store, weight, depth)
+    composite(0, count, slot, sections, appearance, store, features, distance, shown)
     share, rows = weight.reshape(2 * CHUNK), features.reshape(2 * CHUNK, -1)
     opacity = np.empty(CHUNK, np.float32)
     loss = 0.0
@@ -364,7 +376,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
         first, n = np.int64(taps.used[chunk, 0]), np.int64(0)
         if shines:
             n = _see_mirrors(
-                sub, some, begin, here, store, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal.mirror_epsilon,
+                sub, some, begin, here, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal.mirror_epsilon,
                 mirrored,
             )  # fmt: skip
         for i in range(sub, sub + some):
@@ -395,11 +407,35 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             loss += np.float64(w * off * off + along * opacity[i])
             for which in range(2):
                 g_share[which * CHUNK + i] += _f(2.0) * w * off + along
-    rays_backward(
-        0, count, chunk, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, grid.active, surface, appearance.active,
-        store,
-    )  # fmt: skip
+    rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
+    kept.turned_out[chunk], kept.output_out[chunk] = _ZERO, _ZERO
+    n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
+    samples_backward(kept.block[chunk], store.hidden[slot], store.sdf[slot], n, grid.active, surface, kept.turned_out[chunk], kept.output_out[chunk])
     return loss
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-def]
+    """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Hidden units and
+    gradients of these samples move to the front of their arrays."""
+    sdf, block, hidden, out = store.sdf[slot], store.block[slot], store.hidden[slot], kept.block[chunk]
+    n = np.int64(0)
+    for i in range(store.samples[slot, 0]):
+        if sdf[i] == _ZERO:
+            continue
+        for j in range(width):
+            out[n, j] = block[i, j]
+        if n < i:
+            hidden[n] = hidden[i]
+            sdf[n] = sdf[i]
+        n += 1
+    kept.samples[chunk, 0] = n
+    sections = store.s_count[slot, 0]
+    kept.sections[chunk, 0] = sections
+    for i in range(sections):
+        for j in range(s_width):
+            kept.s_block[chunk, i, j] = store.s_block[slot, i, j]
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -431,19 +467,19 @@ def _learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface,
         at[n, 0], at[n, 1], at[n, 2] = px + eikonal.noise[q, 0], py + eikonal.noise[q, 1], pz + eikonal.noise[q, 2]
         shallow[n] = eikonal.shallow if _is_within(at[n]) else _ONE
         n += 1
-    _slopes(at, n, eikonal.epsilon, grid, surface, taps, chunk, found)
+    _slopes(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
     loss = 0.0
     for i in range(n):
         at[i, 0], at[i, 1], at[i, 2] = _ZERO, _ZERO, _ZERO
         loss += _pull(found[i], factor, shallow[i], at[i])
-    _slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, 0)
+    _slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
     return loss
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _work(  # type: ignore[no-untyped-def]
     worker, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured,
-    gain, opacities, eikonal, store, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """Take chunks of rays, and then points, until there are none."""
     total, points = rays.origins.shape[0], eikonal.points.shape[0]
@@ -455,7 +491,7 @@ def _work(  # type: ignore[no-untyped-def]
             begin = chunk * CHUNK
             out.loss[chunk] = _learn_rays(
                 chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, surface, appearance, layers,
-                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, taps, shaded, scratch, out,
+                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out,
                 samples, squared, mirrored, g_mirrored, g_gain,
             )  # fmt: skip
             continue
@@ -471,7 +507,7 @@ def _work(  # type: ignore[no-untyped-def]
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def learn_rays(  # type: ignore[no-untyped-def]
     threads, next_task, rays, states, sampling, grid, network, appearance, shader, light, lamps, far_light, view, measured, gain, opacities, eikonal,
-    store, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """See ``learning.learn``: all but the gradients of the tables, which ``learn_tables`` adds up.
 
@@ -494,27 +530,32 @@ def learn_rays(  # type: ignore[no-untyped-def]
     for worker in prange(threads):
         _work(
             np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, shader.heads, shader.heads_bias,
-            network_of_light, lamps, far_light, view, measured, gain, opacities, eikonal, store, taps, shaded, scratch, out, samples, squared,
+            network_of_light, lamps, far_light, view, measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared,
             mirrored, g_mirrored, g_gain,
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_levels(next_task, chunks, point_chunks, grid, appearance, store, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+def _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+    """Take levels, of the surface's table and then of the appearance's, until there are none."""
     while True:
         task = take(next_task, 0)
-        if task >= grid.active + appearance.active:
+        level = task - grid.active
+        if level >= appearance.active:
             return
-        add_level(task, chunks, grid, appearance, store, gradient, a_gradient)
-        if task < grid.active:
-            for chunk in range(chunks + point_chunks):
-                scatter_block(taps.block[chunk], np.int64(taps.used[chunk, 0]), grid, gradient, task)
+        for chunk in range(chunks):
+            if level < 0:
+                scatter_block(kept.block[chunk], kept.samples[chunk, 0], grid, gradient, task)
+            else:
+                scatter_block(kept.s_block[chunk], kept.sections[chunk, 0], appearance, a_gradient, level)
+        for chunk in range(chunks + point_chunks if level < 0 else 0):
+            scatter_block(taps.block[chunk], taps.used[chunk, 0], grid, gradient, task)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def learn_tables(threads, next_task, rays, points, grid, appearance, store, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+def learn_tables(threads, next_task, rays, points, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Add what ``learn_rays`` found to the gradients of both tables, a task for each level."""
     chunks, point_chunks = (rays + CHUNK - 1) // CHUNK, (points + POINTS - 1) // POINTS
     next_task[0] = 0
     for _ in prange(threads):
-        _add_levels(next_task, chunks, point_chunks, grid, appearance, store, taps, gradient, a_gradient)
+        _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient)

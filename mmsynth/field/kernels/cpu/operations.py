@@ -18,7 +18,7 @@ from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
-from mmsynth.field.kernels.cpu.learning import TapStore
+from mmsynth.field.kernels.cpu.learning import TableStore, TapStore
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
     SurfaceStore,
@@ -27,6 +27,7 @@ from mmsynth.field.kernels.cpu.stores import (
     ray_store,
     shading_store,
     surface_store,
+    table_store,
     tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
@@ -95,7 +96,7 @@ def _kept(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def _of_weights(arrays: SurfaceStore | RayStore | TapStore, chunks: int, like: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _of_weights(arrays: SurfaceStore | RayStore | TableStore | TapStore, chunks: int, like: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Gradients of a network's hidden layer, which is like this one, and of its last."""
     units, inputs = like.shape
     output = arrays.output_out[:chunks].sum(0)
@@ -331,9 +332,10 @@ def learn(
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
         gain = of_frames[gains.frame.numpy()]
-    store, taps = ray_store(chunks, units, levels, len(appearance.resolutions)), tap_store(tasks, units, levels)
+    store, taps = ray_store(threads, units, levels, len(appearance.resolutions)), tap_store(tasks, units, levels)
+    kept = table_store(chunks, units, levels, len(appearance.resolutions))
     weights = shading_store(max(chunks, threads), shader)
-    scratch = chunk_scratch(threads, features, len(columns), hidden)
+    scratch = chunk_scratch(threads, units, features, len(columns), hidden)
     out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
     squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
     g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
@@ -341,12 +343,12 @@ def learn(
     table, look = _arrays(grid), _arrays(appearance)
     learning.learn_rays(
         threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining, lamps,
-        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, taps.arrays,
+        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays, taps.arrays,
         weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
     gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
-    learning.learn_tables(threads, next_task, count, points, table, look, store.arrays, taps.arrays, *gradients)
-    for arrays, parts in ((store.arrays, chunks), (taps.arrays, tasks)):
+    learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
+    for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
         for weight, gradient in zip((network.hidden, network.output), _of_weights(arrays, parts, network.hidden), strict=True):
             _add_gradient(weight, gradient)
     for name, weight in shader._asdict().items():

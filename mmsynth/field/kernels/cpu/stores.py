@@ -9,7 +9,7 @@ import numpy as np
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
 from mmsynth.field.kernels.cpu import learning, shading
-from mmsynth.field.kernels.cpu.learning import ChunkScratch, LightOut, TapStore
+from mmsynth.field.kernels.cpu.learning import ChunkScratch, LightOut, TableStore, TapStore
 from mmsynth.field.kernels.cpu.marching import CAPACITY, CHUNK
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS
 from mmsynth.field.kernels.cpu.surface import POINTS
@@ -17,6 +17,7 @@ from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
 _POOLED = 12
+_TAPS = 4 * learning.MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
 _pool: list[tuple[Any, Any]] = []
 
 
@@ -141,15 +142,26 @@ def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
 
 def tap_store(slots: int, units: int, levels: int) -> Store[TapStore]:
     """Of points at which a surface of so many hidden units and levels is asked for its gradient."""
-    return Store(slots, TapStore, {"used": (np.int64, (1,)), **_network(4 * learning.MOST_TAPPED + TILE_ROWS, units, levels)})
+    sizes = _network(_TAPS, units, levels)
+    del sizes["hidden"]
+    return Store(slots, TapStore, {"used": (np.int64, (1,)), **sizes})
 
 
-def chunk_scratch(slots: int, features: int, materials: int, hidden: int) -> Store[ChunkScratch]:
-    """Of rays with so many features, numbers of a material and units of the hidden layer of its network."""
+def table_store(slots: int, units: int, levels: int, appearance_levels: int) -> Store[TableStore]:
+    """Of the samples and sections of rays, of such a surface and an appearance of so many levels."""
+    sizes = _network(CAPACITY, units, levels)
+    del sizes["hidden"]
+    sizes["s_block"] = np.float32, (CAPACITY, FIRST_FEATURE_ROW + FEATURES * appearance_levels)
+    return Store(slots, TableStore, {"samples": (np.int64, (1,)), "sections": (np.int64, (1,)), **sizes})
+
+
+def chunk_scratch(slots: int, units: int, features: int, materials: int, hidden: int) -> Store[ChunkScratch]:
+    """Of a surface of so many hidden units, rays with so many features, numbers of a material and hidden units of its network."""
     f, whole = np.float32, _whole
     rows, columns = 2 * CHUNK, (2, CHUNK)
     three, some = (f, (rows, 3)), 2 * shading.CHUNK
     sizes: Sizes = {
+        "hidden": (f, (_TAPS, whole(units))),
         "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f, (CHUNK,)),
         "behind": (np.int64, (CHUNK,)), "mixed": (f, (rows, features)), "mixed_share": (f, (rows,)), "g_features": (f, (rows, features)),
         "g_share": (f, (rows,)), "material": (f, (rows, materials)), "normals": three, "points": three, "directions": three, "slopes": three,

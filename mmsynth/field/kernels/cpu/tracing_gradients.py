@@ -23,14 +23,10 @@ _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rays_backward(  # type: ignore[no-untyped-def]
-    begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
-):
-    """``trace_backward`` of the rays of a chunk, of which ``begin`` is the first in ``behind``."""
+def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store):  # type: ignore[no-untyped-def]
+    """Distances and features of the sections become their gradients, of the rays in a slot of the store, of which ``begin`` is the first in
+    ``behind``."""
     sdf, q_of, opacity_of, id_of = store.sdf, store.q_of, store.opacity_of, store.id_of
-    turned_out, output_out, block, hidden = store.turned_out, store.output_out, store.block[chunk], store.hidden[chunk]
-    turned_out[chunk] = np.float32(0.0)
-    output_out[chunk] = np.float32(0.0)
     sections = store.s_count[chunk, 0]
     sf = store.s_block[chunk]
     at = 0
@@ -70,13 +66,14 @@ def rays_backward(  # type: ignore[no-untyped-def]
                 d_tau = (g_section[k] * transmittance - total) * sharpness
                 sdf[chunk, id_of[chunk, first + k]] += np.float32(d_tau * q_of[chunk, first + k])
                 sdf[chunk, id_of[chunk, first + k + 1]] -= np.float32(d_tau * q_of[chunk, first + k + 1])
-    used, samples = np.int64(0), np.int64(store.samples[chunk, 0])
-    while used < samples:
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def samples_backward(block, hidden, g, samples, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
+    """``surface_block_backward`` of many samples, a part at a time."""
+    for used in range(0, samples, LANES):
         n = np.int64(min(LANES, samples - used))
-        surface_block_backward(
-            block[used:], hidden[used:], sdf[chunk, used:], n, active, layers, turned_out[chunk], output_out[chunk]
-        )
-        used += n
+        surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -96,20 +93,12 @@ def trace_backward(  # type: ignore[no-untyped-def]
     for task in prange((rays + CHUNK - 1) // CHUNK):
         chunk = np.int64(task)
         begin = chunk * CHUNK
-        rays_backward(
-            begin, min(CHUNK, rays - begin), chunk, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active,
-            store,
-        )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_level(task, chunks, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
-    """The gradient of a level of the surface's table or, after these, of the appearance's."""
-    for chunk in range(chunks):
-        if task < grid.active:
-            scatter_block(store.block[chunk], np.int64(store.samples[chunk, 0]), grid, gradient, task)
-        else:
-            scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
+        count, turned_out, output_out = min(CHUNK, rays - begin), store.turned_out[chunk], store.output_out[chunk]
+        rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store)
+        turned_out[:], output_out[:] = np.float32(0.0), np.float32(0.0)
+        samples_backward(
+            store.block[chunk], store.hidden[chunk], store.sdf[chunk], np.int64(store.samples[chunk, 0]), active, layers, turned_out, output_out
+        )
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -117,7 +106,12 @@ def trace_scatter(rays, grid, appearance, store, gradient, a_gradient):  # type:
     """Both tables' gradients, one task per level and table."""
     chunks = (rays + CHUNK - 1) // CHUNK
     for each in prange(grid.active + appearance.active):
-        add_level(np.int64(each), chunks, grid, appearance, store, gradient, a_gradient)
+        task = np.int64(each)
+        for chunk in range(chunks):
+            if task < grid.active:
+                scatter_block(store.block[chunk], np.int64(store.samples[chunk, 0]), grid, gradient, task)
+            else:
+                scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
