@@ -67,56 +67,53 @@ def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contracted):  # type: ignore[no-untyped-def]
-    """The first place at or after t where a surface may be: t, position, speed there, state; t >= far when there is none."""
+def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted, skipped):  # type: ignore[no-untyped-def]
+    """t, position, distance from the centre, speed and state: at t where a surface may be there, else, with the state of a free cell, behind
+    that cell. skipped: whether the ray comes from one."""
     grid = states.shape[0]
-    half = np.float32(0.5 * grid / extent)
-    skipped = False
-    while t < far:
-        x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-        cx, cy, cz, vx, vy, vz, r, speed = x, y, z, dx, dy, dz, np.float32(1.0), np.float32(1.0)
-        if contracted:
-            square = x * x + y * y + z * z
-            if square > np.float32(1.0):  # ``contract`` and ``velocity`` at once, of a direction of unit length
-                r = np.float32(math.sqrt(square))
-                inverse = np.float32(1.0) / r
-                k = (np.float32(2.0) - inverse) * inverse
-                along = (x * dx + y * dy + z * dz) * inverse
-                radial = along * (inverse * inverse - k) * inverse
-                cx, cy, cz = x * k, y * k, z * k
-                vx, vy, vz = dx * k + x * radial, dy * k + y * radial, dz * k + z * radial
-                # from the parts along the radius and across it: 1 - along² would be rounding alone far away
-                along *= inverse
-                px, py, pz = dx - x * along, dy - y * along, dz - z * along
-                outward = along * inverse
-                speed = np.float32(math.sqrt(k * k * (px * px + py * py + pz * pz) + outward * outward))
-        ix = min(max(int((cx + extent) * half), 0), grid - 1)
-        iy = min(max(int((cy + extent) * half), 0), grid - 1)
-        iz = min(max(int((cz + extent) * half), 0), grid - 1)
-        state = states[ix, iy, iz]
-        if state < OUTSIDE:
-            if skipped:  # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
-                t += jitter * step / speed
-                x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-                if contracted:
-                    cx, cy, cz, _ = contract(x, y, z)
-                else:
-                    cx, cy, cz = x, y, z
-            return t, cx, cy, cz, r, speed, state
-        skipped = True
-        leave = _NO_CROSSING
-        if abs(vx) > ALONG_FACE:
-            leave = min(leave, (np.float32(ix + (1 if vx > 0 else 0)) / half - extent - cx) / vx)
-        if abs(vy) > ALONG_FACE:
-            leave = min(leave, (np.float32(iy + (1 if vy > 0 else 0)) / half - extent - cy) / vy)
-        if abs(vz) > ALONG_FACE:
-            leave = min(leave, (np.float32(iz + (1 if vz > 0 else 0)) / half - extent - cz) / vz)
-        # the cell's certificate may reach beyond it
-        leave = max(leave, np.float32(state - OUTSIDE) / (half * speed * np.float32(2.0))) + _FACE_OVERSHOOT * step / speed
-        if contracted:
-            leave = min(leave, _LONGEST_STEP * max(r, np.float32(1.0)))
-        t = max(t + leave, t * _LEAST_ADVANCE)
-    return far, np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(1.0), np.uint8(0)
+    half, width = np.float32(0.5 * grid / extent), np.float32(2.0 * extent / grid)
+    x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+    cx, cy, cz, vx, vy, vz, r, speed = x, y, z, dx, dy, dz, np.float32(1.0), np.float32(1.0)
+    if contracted:
+        square = x * x + y * y + z * z
+        if square > np.float32(1.0):  # ``contract`` and ``velocity`` at once, of a direction of unit length
+            r = np.float32(math.sqrt(square))
+            inverse = np.float32(1.0) / r
+            k = (np.float32(2.0) - inverse) * inverse
+            along = (x * dx + y * dy + z * dz) * inverse
+            radial = along * (inverse * inverse - k) * inverse
+            cx, cy, cz = x * k, y * k, z * k
+            vx, vy, vz = dx * k + x * radial, dy * k + y * radial, dz * k + z * radial
+            # from the parts along the radius and across it: 1 - along² would be rounding alone far away
+            along *= inverse
+            px, py, pz = dx - x * along, dy - y * along, dz - z * along
+            outward = along * inverse
+            speed = np.float32(math.sqrt(k * k * (px * px + py * py + pz * pz) + outward * outward))
+    ix = min(max(int((cx + extent) * half), 0), grid - 1)
+    iy = min(max(int((cy + extent) * half), 0), grid - 1)
+    iz = min(max(int((cz + extent) * half), 0), grid - 1)
+    state = states[ix, iy, iz]
+    if state < OUTSIDE:
+        if skipped:  # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
+            t += jitter * step / speed
+            x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+            if contracted:
+                cx, cy, cz, _ = contract(x, y, z)
+            else:
+                cx, cy, cz = x, y, z
+        return t, cx, cy, cz, r, speed, state
+    leave = _NO_CROSSING
+    if abs(vx) > ALONG_FACE:
+        leave = min(leave, (np.float32(ix + (1 if vx > 0 else 0)) * width - extent - cx) / vx)
+    if abs(vy) > ALONG_FACE:
+        leave = min(leave, (np.float32(iy + (1 if vy > 0 else 0)) * width - extent - cy) / vy)
+    if abs(vz) > ALONG_FACE:
+        leave = min(leave, (np.float32(iz + (1 if vz > 0 else 0)) * width - extent - cz) / vz)
+    # the cell's certificate may reach beyond it
+    leave = max(leave, np.float32(state - OUTSIDE) / (half * speed * np.float32(2.0))) + _FACE_OVERSHOOT * step / speed
+    if contracted:
+        leave = min(leave, _LONGEST_STEP * max(r, np.float32(1.0)))
+    return max(t + leave, t * _LEAST_ADVANCE), cx, cy, cz, r, speed, state
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -131,39 +128,54 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
     # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
     where = np.empty(CHUNK, np.float32)
-    tau_of = np.empty(CHUNK, np.float64)
+    tau_of = np.zeros(CHUNK, np.float64)
+    for i in range(count):
+        where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
+        counts[slot, i] = 0
     speed_of = np.empty(CHUNK, np.float32)
     reach_of = np.empty(CHUNK, np.float32)
     state_of = np.empty(CHUNK, np.uint8)
-    lanes = np.empty(LANES, np.int32)
+    lanes, todo = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
+    skipped = np.zeros(CHUNK, np.bool_)
     going = 0
     waiting = 0
     used = np.int64(0)
     while going > 0 or waiting < count:
         n = np.int64(0)
-        taken = 0
-        while n < LANES and (taken < going or waiting < count):
-            if taken < going:
-                i = lanes[taken]
-                taken += 1
-            else:
-                i = np.int32(waiting)
-                waiting += 1
-                where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
-                tau_of[i] = 0.0
-                counts[slot, i] = 0
-            o = begin + i
-            t, x, y, z, r, speed, state = _advance(
-                origins[o, 0], origins[o, 1], origins[o, 2], directions[o, 0], directions[o, 1], directions[o, 2],
-                where[i], rays.far[o], rays.jitter[o], step, states, grid.extent, contracted,
-            )  # fmt: skip
-            if t >= rays.far[o]:
-                continue
-            where[i] = t
-            speed_of[i], reach_of[i], state_of[i] = speed, r, state
-            lanes[n] = i
-            block[used + n, 0], block[used + n, 1], block[used + n, 2], block[used + n, 3] = x, y, z, np.float32(1.0)
-            n += 1
+        pending = going
+        todo[:going] = lanes[:going]
+        while pending < LANES and waiting < count:
+            todo[pending] = waiting
+            pending += 1
+            waiting += 1
+        # all lanes go on by a cell in turn, and not one lane by all its cells: reading the states takes long, and so these reads overlap
+        while pending > 0:
+            left = 0
+            for a in range(pending):
+                i = todo[a]
+                o = begin + i
+                t = where[i]
+                if t >= rays.far[o]:
+                    if waiting < count:
+                        todo[left] = waiting
+                        left += 1
+                        waiting += 1
+                    continue
+                t, x, y, z, r, speed, state = _advance(
+                    origins[o, 0], origins[o, 1], origins[o, 2], directions[o, 0], directions[o, 1], directions[o, 2],
+                    t, rays.jitter[o], step, states, grid.extent, contracted, skipped[i],
+                )  # fmt: skip
+                where[i] = t
+                skipped[i] = state >= OUTSIDE
+                if state >= OUTSIDE:
+                    todo[left] = i
+                    left += 1
+                elif t < rays.far[o]:
+                    speed_of[i], reach_of[i], state_of[i] = speed, r, state
+                    lanes[n] = i
+                    block[used + n, 0], block[used + n, 1], block[used + n, 2], block[used + n, 3] = x, y, z, np.float32(1.0)
+                    n += 1
+            pending = left
         if n == 0:
             break
         surface_block(block[used:], hidden[used:], sdf[used:], n, grid, layers)
