@@ -212,7 +212,7 @@ class Trainer:
         # what is NaN in a sample is NaN in a sum
         if not bool(torch.isfinite(loss)):
             reason = "the loss is not finite"
-        elif not all(bool(torch.isfinite(p.grad.sum())) for p in self.networks if p.grad is not None):
+        elif not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
             reason = "a gradient is not finite"
         else:
             return None

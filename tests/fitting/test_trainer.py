@@ -388,7 +388,7 @@ def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -
 def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     trainer.recipe = _recipe(**changes)
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
-    return float(trainer._loss(batch, sampling, torch.Generator().manual_seed(0))[0].detach())
+    return float(trainer._learn(batch, sampling, np.random.default_rng(0), torch.Generator().manual_seed(0)).loss)
 
 
 @torch.no_grad()
