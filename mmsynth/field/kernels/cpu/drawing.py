@@ -35,13 +35,12 @@ def _bits(key, number, purpose):  # type: ignore[no-untyped-def]
 @njit(cache=True, inline="always", error_model="numpy")
 def _first_above(ascending, begin, end, value):  # type: ignore[no-untyped-def]
     """The first of a range whose number is larger than ``value``."""
-    while begin < end:
-        middle = (begin + end) // 2
-        if ascending[middle] > value:
-            end = middle
-        else:
-            begin = middle + 1
-    return begin
+    length = end - begin
+    while length > 1:  # without a branch that nobody could predict
+        half = length // 2
+        begin += half if ascending[begin + half - 1] <= value else 0
+        length -= half
+    return begin + (1 if length > 0 and ascending[begin] <= value else 0)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
