@@ -208,7 +208,8 @@ def _alone(target: list[float], saturation: float, level: float) -> Batch:
     output, no_axes = 0 * number, torch.empty(0, 3)
     measured = Measured(torch.tensor(target), number, output, no_axes, full(level), full(saturation), full(1 / count))
     parts = {"mono": (slice(0, count), slice(0, count))}
-    return Batch(torch.zeros(count, 3), torch.zeros(count, 3), measured, 0 * number, parts, full(float("nan")), full(1.0), {})
+    zero, none = torch.zeros(count, 3), full(float("nan"))
+    return Batch(zero, zero, full(0.5), measured, 0 * number, parts, none, full(1.0), 0 * number)
 
 
 def test_saturated_targets_only_pull_upwards() -> None:
