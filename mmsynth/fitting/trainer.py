@@ -21,13 +21,14 @@ from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
-from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, in_order, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
@@ -77,14 +78,17 @@ class Trainer:
     for any interruption; with ``budget`` it follows the clock.
     """
 
-    def __init__(self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str) -> None:
+    def __init__(
+        self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str, on_load: OnLoad | None = None
+    ) -> None:
         if (steps is None) == (budget is None):
             raise InputError("fit: give either a number of steps or a time budget, not both.")
         self.recipe, self.steps, self.budget, self.seed = recipe, steps, budget, seed
         self.device = torch.device(device)
         torch.manual_seed(seed)
-        self.measurements: dict[str, Measurements] = load_measurements(scene)
-        self.needs: Needs = assess(scene, self.measurements, recipe, seed, expected_rays(recipe, steps, budget))
+        rays_to_come = expected_rays(recipe, steps, budget)
+        self.measurements: Measurements = load_measurements(scene, rays_to_come=rays_to_come, device=self.device, on_load=on_load)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come)
         sensors = {n: m.sensor for n, m in self.measurements.items()}
         radiance_scale = {n: m.radiance_scale for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
@@ -105,9 +109,9 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.importance = Importance({n: m.pixels.size for n, m in self.measurements.items()}, recipe.sampling.evenly)
+        self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
-        self.has_empty = any(m.empty is not None for m in self.measurements.values())
+        self.has_empty = self.measurements.empty is not None
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -194,18 +198,17 @@ class Trainer:
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
 
     def _draw(self, random: np.random.Generator) -> Batch:
-        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.device, self.importance)
+        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.importance.selection)
 
     def _rays(self) -> dict[str, int]:
         """Of a step, how many of each modality."""
         total = sum(self.needs.share.values())
         return {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
 
-    def _rays_outside(self, random: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Some rays outside the object's masks, (R, 3) each, whose opacity should be 0. Their colours are those of a background that is
-        not the object's, or of a picture that was painted white there: they are not looked at."""
-        rays = {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}
-        return draw_empty(self.measurements, rays, random, self.device)
+    def _rays_outside(self, random: np.random.Generator) -> Batch:
+        """Some rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the
+        object's, or of a picture that was painted white there: they are not looked at."""
+        return draw_empty(self.measurements, {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}, random)
 
     def _wrong(self, loss: torch.Tensor) -> str | None:
         """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
@@ -229,16 +232,16 @@ class Trainer:
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _learn(
-        self, batch: Batch, sampling: kernels.Sampling, random: np.random.Generator, generator: torch.Generator
-    ) -> kernels.Learned:
+    def _learn(self, batch: Batch, sampling: kernels.Sampling, random: np.random.Generator, generator: torch.Generator) -> kernels.Learned:
         """The loss of a batch; gradients are added to ``grad`` of all that is learned."""
-        field, origins, directions = self.field, batch.origins, batch.directions
+        field, origins, directions, jitter = self.field, batch.origins, batch.directions, batch.jitter
         if self.has_empty:
-            origins, directions = (torch.cat(pair) for pair in zip((origins, directions), self._rays_outside(random), strict=True))
+            more = self._rays_outside(random)
+            origins, directions = torch.cat([origins, more.origins]), torch.cat([directions, more.directions])
+            jitter = torch.cat([jitter, more.jitter])
         count = len(origins)
         near, far = rendering.interval(field.surface, origins, directions)
-        rays = kernels.Rays(origins, directions, near, far, torch.rand(count, generator=generator).to(self.device))
+        rays = kernels.Rays(origins, directions, near, far, jitter)
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
         outside = count - len(trains)
@@ -287,11 +290,12 @@ class Trainer:
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
-        out = {}
+        out, residuals = {}, []
         for name, (rays, numbers) in batch.parts.items():
             found = squared[numbers].reshape(rays.stop - rays.start, -1).mean(1)
             out[name] = float((batch.ray_weight[rays] * found).mean())
-            self.importance.learn(name, batch.pixels[name], (found.sqrt() / self.measurements[name].radiance_scale).cpu().numpy())
+            residuals.append(found.sqrt() / self.measurements[name].radiance_scale)
+        self.importance.learn(batch.tile, torch.cat(residuals))
         return out
 
     @property
@@ -307,7 +311,7 @@ class Trainer:
         return self._gain()[batch.frame] if self._has_gains else None
 
     def _look(self, sampling: kernels.Sampling, rays: dict[str, int], random: np.random.Generator) -> RayJacobian:
-        batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
+        batch = draw(self.measurements, self.field.shader.columns, rays, random)
         far_light = self.state.decided is not None
         return ray_residuals(self.field, batch, batch.per_ray(self.field.view_dependence), self._gain_of(batch), far_light, sampling)
 
@@ -335,7 +339,7 @@ class Trainer:
         """Exposure of each training frame relative to the mean, per modality; empty when no gains were needed."""
         if not self._has_gains:
             return {}
-        order = in_order(self.measurements)
+        order = self.measurements.order
         parts = self._gain().detach().cpu().split([len(self.measurements[n].origins) for n in order])
         return {n: part.tolist() for n, part in zip(order, parts, strict=True)}
 

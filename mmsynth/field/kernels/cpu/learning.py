@@ -410,7 +410,9 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
     kept.turned_out[chunk], kept.output_out[chunk] = _ZERO, _ZERO
     n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
-    samples_backward(kept.block[chunk], store.hidden[slot], store.sdf[slot], n, grid.active, surface, kept.turned_out[chunk], kept.output_out[chunk])
+    samples_backward(
+        kept.block[chunk], store.hidden[slot], store.sdf[slot], n, grid.active, surface, kept.turned_out[chunk], kept.output_out[chunk]
+    )
     return loss
 
 

@@ -31,8 +31,8 @@ from mmsynth.field.kernels.constants import (
     SOLID,
 )
 from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, encode_block, padded_output, surface_block
-from mmsynth.field.kernels.cpu.matrices import padded_to
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
+from mmsynth.field.kernels.cpu.matrices import padded_to
 
 CHUNK = 128  # rays
 LANES = 64

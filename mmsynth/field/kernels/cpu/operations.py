@@ -17,8 +17,8 @@ from torch import Tensor
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, surface, tracing_gradients
-from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.learning import TableStore, TapStore
+from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
     SurfaceStore,
@@ -322,12 +322,17 @@ def learn(
     chunks, threads = -(-count // CHUNK), get_num_threads()
     tasks = chunks + -(-points // learning.POINTS)
     units, levels = len(network.hidden), len(grid.resolutions)
-    features, hidden = light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions), len(light.first)
+    features, hidden = (
+        light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions),
+        len(light.first),
+    )
     used = light.used.numpy()
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
     lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining = LightNetwork(*(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:]))
+    shining = LightNetwork(
+        *(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:])
+    )
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)

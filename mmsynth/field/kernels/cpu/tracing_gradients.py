@@ -97,7 +97,14 @@ def trace_backward(  # type: ignore[no-untyped-def]
         rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store)
         turned_out[:], output_out[:] = np.float32(0.0), np.float32(0.0)
         samples_backward(
-            store.block[chunk], store.hidden[chunk], store.sdf[chunk], np.int64(store.samples[chunk, 0]), active, layers, turned_out, output_out
+            store.block[chunk],
+            store.hidden[chunk],
+            store.sdf[chunk],
+            np.int64(store.samples[chunk, 0]),
+            active,
+            layers,
+            turned_out,
+            output_out,
         )
 
 

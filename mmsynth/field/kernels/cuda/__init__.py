@@ -17,9 +17,22 @@ from mmsynth.field.kernels.cuda.shared import available
 from mmsynth.field.kernels.cuda.surface import surface_value
 from mmsynth.field.kernels.mirroring import mirror
 from mmsynth.field.kernels.parameters import GridTable, Hits, Rays, Sampling, SurfaceNetwork
-from mmsynth.field.kernels.reference import adam, compare, composite, shade
+from mmsynth.field.kernels.reference import adam, compare, composite, draw, odds, shade
 
-__all__ = ["adam", "available", "compare", "hash_encode", "march", "mirror", "section_weights", "shade", "surface_value", "trace"]
+__all__ = [
+    "adam",
+    "available",
+    "compare",
+    "draw",
+    "hash_encode",
+    "march",
+    "mirror",
+    "odds",
+    "section_weights",
+    "shade",
+    "surface_value",
+    "trace",
+]
 
 
 def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
