@@ -12,7 +12,6 @@ import torch
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import cpu
-from mmsynth.field.kernels.cpu.optimiser import ADAM_CHUNK
 from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
@@ -61,9 +60,8 @@ def run_kernels() -> None:
     with torch.no_grad():
         kernels.shade(weights, hits.features, directions, 0)
     _draw()
-    for count in (1, ADAM_CHUNK + 1):
-        parameter, gradient, first, second = torch.zeros(4, count)
-        kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
+    parameter, gradient, first, second = torch.zeros(4, 1)
+    kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
 
 
 def _draw() -> None:

@@ -77,6 +77,7 @@ __all__ = [
     "Surroundings",
     "View",
     "adam",
+    "adam_together",
     "compare",
     "contract",
     "contracted_velocity",
@@ -197,3 +198,12 @@ def odds(residual: Tensor, count: Tensor, first_tile: Tensor, evenly: float) -> 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """One step of Adam, in place."""
     _backend(parameter).adam(parameter, gradient, first, second, step)
+
+
+def adam_together(parts: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, AdamStep]]) -> None:
+    """The same of many tensors, what ``adam`` takes of each."""
+    if all(_backend(part[0]) is cpu for part in parts):
+        cpu.adam_together(parts)
+        return
+    for part in parts:
+        adam(*part)
