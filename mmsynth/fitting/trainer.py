@@ -310,7 +310,7 @@ class Trainer:
         assert light is not None
         mirrors, slopes = self.field.mirrors(hits, batch.origins, batch.directions, sampling.active_surface)
         if self.needs.sparse:
-            trains = trains_geometry[kernels.rays_of(hits.behind)]
+            trains = trains_geometry[kernels.rays_of(hits.behind, len(hits.share))]
             kept = lambda x: torch.where(trains if x.dim() == 1 else trains[:, None], x, x.detach())
             mirrors = mirrors._replace(material=kept(mirrors.material), normals=kept(mirrors.normals), share=kept(mirrors.share))
         return kernels.mirror(light.lamps(), mirrors, hits.behind, batch.measured), slopes[hits.distance > 0]
