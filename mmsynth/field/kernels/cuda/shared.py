@@ -16,9 +16,13 @@ except ImportError:
     triton = tl = None
 
 
+# numbers of which kernels are not compiled anew where they happen to be 1 or multiples of 16
+_UNSPECIALIZED = ["count", "rays", "rows", "levels", "active", "k", "grid", "bright", "bisections", "stride", "lamps", "asked"]
+
+
 def jit(function: Any) -> Any:
     """``triton.jit`` that compiles once, not anew for sizes that happen to be 1 or multiples of 16; a no-op without triton."""
-    return function if triton is None else triton.jit(do_not_specialize=["count", "rays", "levels", "active", "k", "grid"])(function)
+    return function if triton is None else triton.jit(do_not_specialize=_UNSPECIALIZED)(function)
 
 
 def constant(value: float) -> Any:
@@ -31,6 +35,7 @@ ALONG_FACE, NO_CROSSING = constant(constants.ALONG_FACE), constant(constants.NO_
 FACE_OVERSHOOT = constant(constants.FACE_OVERSHOOT)
 FIRST_FEATURE_ROW = constant(constants.FIRST_FEATURE_ROW)
 HASH_Y, HASH_Z = constant(constants.HASH_PRIMES[1]), constant(constants.HASH_PRIMES[2])
+HUBER, LEAST_WEIGHT = constant(constants.HUBER_DELTA), constant(constants.LEAST_WEIGHT)
 
 
 @jit
@@ -39,6 +44,39 @@ def position(positions, i, live):  # type: ignore[no-untyped-def]
     y = tl.load(positions + 3 * i + 1, mask=live, other=0.0)
     z = tl.load(positions + 3 * i + 2, mask=live, other=0.0)
     return x, y, z
+
+
+@jit
+def softplus(x):  # type: ignore[no-untyped-def]
+    """log(1 + eˣ) and its slope. Triton has no log1p: below 1e-2 its series, exact to 2e-9 of the result."""
+    e = tl.exp(-tl.abs(x))
+    log1p = tl.where(e < 1e-2, e * (1.0 - e * (0.5 - e * (1.0 / 3.0 - e * 0.25))), tl.log(1.0 + e))
+    return tl.where(x > 0.0, x, 0.0 * x) + log1p, tl.where(x > 0.0, 1.0, e) / (1.0 + e)
+
+
+@jit
+def sigmoid(x):  # type: ignore[no-untyped-def]
+    e = tl.exp(-tl.abs(x))
+    return tl.where(x >= 0.0, 1.0, e) / (1.0 + e)
+
+
+@jit
+def first_number(ray, of, count, bisections):  # type: ignore[no-untyped-def]
+    """The first number of each ray or of those after it, by bisection: ``ray`` (count,) never decreases."""
+    low = of * 0
+    high = low + count
+    for _ in range(0, bisections):
+        middle = (low + high) // 2
+        before = (low < high) & (tl.load(ray + middle, mask=low < high, other=0).to(tl.int32) < of)
+        low, high = tl.where(before, middle + 1, low), tl.where(before, high, middle)
+    return low
+
+
+@jit
+def sum_of_pair(values, PAIRS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """(2 PAIRS,) → the sum of neighbours, at both of them."""
+    both = tl.sum(tl.reshape(values, (PAIRS, 2)), 1)
+    return tl.reshape(tl.broadcast_to(both[:, None], (PAIRS, 2)), (2 * PAIRS,))
 
 
 @jit
