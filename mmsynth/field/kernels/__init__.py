@@ -21,17 +21,23 @@ from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
     AdamStep,
+    Eikonal,
+    Gains,
     GridTable,
     Hits,
     Lamps,
+    Learned,
+    LightNetwork,
     Measured,
     Mirrors,
+    Opacities,
     Rays,
     Samples,
     Sampling,
     ShadedRays,
     ShaderWeights,
     SurfaceNetwork,
+    View,
 )
 from mmsynth.field.kernels.reference import contract, contracted_velocity
 from mmsynth.field.kernels.shading import intensity, photometric, predict, radiance, rays_of, residual
@@ -41,11 +47,16 @@ __all__ = [
     "SHELL",
     "SOLID",
     "AdamStep",
+    "Eikonal",
+    "Gains",
     "GridTable",
     "Hits",
     "Lamps",
+    "Learned",
+    "LightNetwork",
     "Measured",
     "Mirrors",
+    "Opacities",
     "Rays",
     "Reflection",
     "Samples",
@@ -54,12 +65,14 @@ __all__ = [
     "ShaderWeights",
     "SurfaceNetwork",
     "Surroundings",
+    "View",
     "adam",
     "compare",
     "contract",
     "contracted_velocity",
     "hash_encode",
     "intensity",
+    "learn",
     "march",
     "mirror",
     "photometric",
@@ -133,6 +146,28 @@ def compare(
 def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -> Tensor:
     """Mirrored light in each measured number."""
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
+
+
+def learn(
+    grid: GridTable,
+    network: SurfaceNetwork,
+    appearance: GridTable,
+    states: Tensor,
+    shader: ShaderWeights,
+    light: LightNetwork,
+    far_light: Tensor,
+    rays: Rays,
+    view: View,
+    measured: Measured,
+    gains: Gains,
+    opacities: Opacities,
+    eikonal: Eikonal,
+    sampling: Sampling,
+) -> Learned:
+    """A step's loss, and its gradients, added to ``grad`` of what is learned."""
+    return _backend(rays.origins).learn(
+        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling
+    )
 
 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:

@@ -171,6 +171,71 @@ class Mirrors(NamedTuple):
     share: Tensor
 
 
+class LightNetwork(NamedTuple):
+    """Lamps, and a hidden layer that tells from features how surfaces mirror them; weights (out, in), biases (out,).
+
+    Attributes:
+        second, second_bias: 5 + L outputs: roughness, strength, surroundings, transmitted, polarizing, and the visibility of each of L lamps.
+        position: (L, 3), normalised frame. log_spectrum: (L, outputs of the shader). used: (K,) int64, ascending: the lamps that there are;
+            none: surfaces do not shine, and nothing here is asked.
+    """
+
+    first: Tensor
+    first_bias: Tensor
+    second: Tensor
+    second_bias: Tensor
+    position: Tensor
+    log_spectrum: Tensor
+    used: Tensor
+
+
+class View(NamedTuple):
+    """Of R rays: degrees (R,) int64 of the harmonics of direction that are seen; trains_geometry (R,) bool, see ``ShadedRays``."""
+
+    degrees: Tensor
+    trains_geometry: Tensor
+
+
+class Gains(NamedTuple):
+    """log_gain (frames,): exposures relative to their mean are exp(log_gain - mean); empty: all are 1. frame: (M,) int64 of each number."""
+
+    log_gain: Tensor
+    frame: Tensor
+
+
+class Opacities(NamedTuple):
+    """What is known of the opacity o of R rays: Σ weight (o - target)² + linear o is part of the loss; (R,) each, or all empty."""
+
+    target: Tensor
+    weight: Tensor
+    linear: Tensor
+
+
+class Eikonal(NamedTuple):
+    """Where |∇sdf| = 1 is asked for: at points of all space and, of the surfaces that rays meet, at all if they shine, else at some.
+
+    Attributes:
+        points: (P, 3), frame of the grid. noise: (Q, 3): of Q of the R rays, evenly spaced, how far from the surface they meet they ask, where
+            it does not shine. weight: of the term, a mean over P + Q, or P + R where surfaces shine. epsilon, mirror_epsilon: of the differences,
+            at points and where surfaces shine. shallow: factor, within the unit ball, where the slope is below 1 (not where surfaces shine).
+    """
+
+    points: Tensor
+    noise: Tensor
+    weight: float
+    epsilon: float
+    mirror_epsilon: float
+    shallow: float
+
+
+class Learned(NamedTuple):
+    """Of a step: the loss, a scalar; squared (M,), residuals; samples, a number."""
+
+    loss: Tensor
+    squared: Tensor
+    samples: Tensor
+
+
 class AdamStep(NamedTuple):
     """What a step of Adam is told beside its tensors.
 

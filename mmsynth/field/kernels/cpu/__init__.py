@@ -5,10 +5,10 @@ Begin with ``operations``, the autograd functions; the kernels are in ``blocks``
 """
 
 from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled
-from mmsynth.field.kernels.cpu.operations import compare, mirror, shade, surface_value, trace
+from mmsynth.field.kernels.cpu.operations import compare, learn, mirror, shade, surface_value, trace
 from mmsynth.field.kernels.cpu.optimiser import adam
 from mmsynth.field.kernels.reference import hash_encode, march, section_weights
 
 __all__ = [
-    "KERNELS", "adam", "compare", "hash_encode", "is_compiled", "march", "mirror", "section_weights", "shade", "surface_value", "trace",
+    "KERNELS", "adam", "compare", "hash_encode", "is_compiled", "learn", "march", "mirror", "section_weights", "shade", "surface_value", "trace",
 ]  # fmt: skip

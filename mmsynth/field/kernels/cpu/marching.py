@@ -49,7 +49,7 @@ def _softplus(x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _contract(x, y, z):  # type: ignore[no-untyped-def]
+def contract(x, y, z):  # type: ignore[no-untyped-def]
     """Contracted position (mip-NeRF 360, eq. 10) and the distance from the centre."""
     r = np.float32(math.sqrt(x * x + y * y + z * z))
     if r <= np.float32(1.0):
@@ -59,7 +59,7 @@ def _contract(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
+def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Change of the contracted position per unit of ray distance, for a point at distance r from the centre."""
     if r <= np.float32(1.0):
         return dx, dy, dz
@@ -80,8 +80,8 @@ def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contr
         x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
         r = np.float32(0.0)
         if contracted:
-            cx, cy, cz, r = _contract(x, y, z)
-            vx, vy, vz = _velocity(x, y, z, r, dx, dy, dz)
+            cx, cy, cz, r = contract(x, y, z)
+            vx, vy, vz = velocity(x, y, z, r, dx, dy, dz)
         else:
             cx, cy, cz, vx, vy, vz = x, y, z, dx, dy, dz
         speed = np.float32(math.sqrt(vx * vx + vy * vy + vz * vz))
@@ -94,7 +94,7 @@ def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contr
                 t += jitter * step / speed
                 x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
                 if contracted:
-                    cx, cy, cz, _ = _contract(x, y, z)
+                    cx, cy, cz, _ = contract(x, y, z)
                 else:
                     cx, cy, cz = x, y, z
             return t, cx, cy, cz, r, speed, state
@@ -125,7 +125,7 @@ def _to_rows(block, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _march(begin, count, slot, rays, states, sampling, grid, network, store):  # type: ignore[no-untyped-def]
+def march_rays(begin, count, slot, rays, states, sampling, grid, network, store):  # type: ignore[no-untyped-def]
     """Samples of the rays of a chunk and their distances, see ``reference.march``: how many."""
     size = FIRST_FEATURE_ROW + FEATURES * grid.resolutions.shape[0]
     units = network.hidden.shape[0]
@@ -216,7 +216,7 @@ def _march(begin, count, slot, rays, states, sampling, grid, network, store):  #
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight, depth):  # type: ignore[no-untyped-def]
+def find_sections(begin, count, slot, rays, contracted, sampling, store, weight, depth):  # type: ignore[no-untyped-def]
     """Weights of the sections of a chunk's rays: depth, and the sections that matter, in the order of the rays: how many.
 
     weight: (2, R) of the nearest surface of each ray and of what is behind it.
@@ -258,7 +258,7 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
                     y = origins[o, 1] + directions[o, 1] * t
                     z = origins[o, 2] + directions[o, 2] * t
                     if contracted:
-                        x, y, z, _ = _contract(x, y, z)
+                        x, y, z, _ = contract(x, y, z)
                     if sections > first and nearest < 0.0:
                         last = 3 * (sections - 1)
                         dx, dy, dz = x - s_block[slot, last], y - s_block[slot, last + 1], z - s_block[slot, last + 2]
@@ -281,7 +281,7 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
+def composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
     """Features and distance of a chunk's rays: the mean over the sections of each surface, (2, R, F) and (2, R)."""
     s_block, width = store.s_block, FEATURES * appearance.active
     _to_rows(s_block[slot], sections)
@@ -313,7 +313,7 @@ def trace_forward(rays, states, sampling, grid, network, appearance, keep, store
         slot = np.int64(chunk) if keep else np.int64(get_thread_id())
         begin = np.int64(chunk) * CHUNK
         count = min(CHUNK, total - begin)
-        samples[chunk] = _march(begin, count, slot, rays, states, sampling, grid, network, store)
+        samples[chunk] = march_rays(begin, count, slot, rays, states, sampling, grid, network, store)
         contracted = grid.extent > np.float32(1.0)
-        sections = _find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
-        _composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)
+        sections = find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
+        composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)

@@ -16,21 +16,36 @@ from torch import Tensor
 
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
-from mmsynth.field.kernels.cpu import marching, mirroring, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
-from mmsynth.field.kernels.cpu.stores import RayStore, SurfaceStore, ray_store, shading_store, surface_store
+from mmsynth.field.kernels.cpu.stores import (
+    RayStore,
+    SurfaceStore,
+    chunk_scratch,
+    light_out,
+    ray_store,
+    shading_store,
+    surface_store,
+    tap_store,
+)
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.parameters import (
+    Eikonal,
+    Gains,
     GridTable,
     Hits,
     Lamps,
+    Learned,
+    LightNetwork,
     Measured,
     Mirrors,
+    Opacities,
     Rays,
     Sampling,
     ShadedRays,
     ShaderWeights,
     SurfaceNetwork,
+    View,
 )
 
 P = TypeVar("P", bound=tuple[Any, ...])
@@ -274,3 +289,84 @@ class _Mirror(torch.autograd.Function):
             mirroring.Gradients(*(x.numpy() for x in (*of_rows, *of_lamps))),
         )  # fmt: skip
         return None, None, None, *(x.sum(0) for x in of_lamps), *of_rows
+
+
+@torch.no_grad()
+def learn(
+    grid: GridTable,
+    network: SurfaceNetwork,
+    appearance: GridTable,
+    states: Tensor,
+    shader: ShaderWeights,
+    light: LightNetwork,
+    far_light: Tensor,
+    rays: Rays,
+    view: View,
+    measured: Measured,
+    gains: Gains,
+    opacities: Opacities,
+    eikonal: Eikonal,
+    sampling: Sampling,
+) -> Learned:
+    """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
+    count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
+    chunks, threads = -(-count // CHUNK), get_num_threads()
+    tasks = chunks + -(-points // learning.POINTS)
+    units, width = network.hidden.shape
+    features, hidden = light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions), len(light.first)
+    used = light.used.numpy()
+    parts = len(light.second_bias) - len(light.position)
+    columns = np.concatenate([np.arange(parts), parts + used])
+    lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
+    shining = LightNetwork(*(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:]))
+    gain = np.empty(0, np.float32)
+    if len(gains.log_gain):
+        of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
+        gain = of_frames[gains.frame.numpy()]
+    store, taps = ray_store(chunks, units, width, len(appearance.resolutions)), tap_store(tasks, units, width)
+    weights = shading_store(max(chunks, threads), shader)
+    scratch = chunk_scratch(threads, features, len(columns), hidden)
+    out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
+    squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
+    g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
+    next_task = np.zeros(1, np.int64)
+    table, look = _arrays(grid), _arrays(appearance)
+    learning.learn_rays(
+        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining, lamps,
+        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, taps.arrays,
+        weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
+    )  # fmt: skip
+    gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
+    learning.learn_tables(threads, next_task, count, points, table, look, store.arrays, taps.arrays, *gradients)
+    of_rays, of_points = store.arrays, taps.arrays
+    _add_gradient(network.hidden, of_rays.hidden_out[:chunks].sum(0) + of_points.hidden_out[:tasks].sum(0))
+    _add_gradient(network.output, of_rays.output_out[:chunks].sum(0) + of_points.output_out[:tasks].sum(0))
+    for name, weight in shader._asdict().items():
+        whole = getattr(weights.arrays, f"{name}_out")[:chunks].sum(0)
+        _add_gradient(weight, whole[tuple(slice(n) for n in weight.shape)])
+    found = out.arrays
+    if len(used):
+        _add_gradient(light.first, found.first[:chunks].sum(0)[:hidden, :features])
+        _add_gradient(light.first_bias, found.first_bias[:chunks].sum(0)[:hidden])
+        _add_gradient(light.second, found.second[:chunks].sum(0)[: len(columns), :hidden], columns)
+        _add_gradient(light.second_bias, found.second_bias[:chunks].sum(0), columns)
+        _add_gradient(light.position, found.position[:chunks].sum(0), used)
+        _add_gradient(light.log_spectrum, found.spectrum[:chunks].sum(0) * lamps.spectrum, used)
+    if len(far_light):
+        _add_gradient(far_light, found.far[:chunks].sum(0))
+    if len(gain):
+        by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
+        _add_gradient(gains.log_gain, (by_frame - by_frame.mean()).astype(np.float32))
+    loss = torch.tensor(found.loss[:tasks].sum(), dtype=torch.float32)
+    return Learned(loss, torch.from_numpy(squared), torch.tensor(samples.sum()))
+
+
+def _add_gradient(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray | None = None) -> None:
+    """To ``tensor.grad``, or some of its rows."""
+    if tensor.grad is None:
+        tensor.grad = torch.zeros_like(tensor)
+    grad = tensor.grad.numpy()
+    if rows is None:
+        grad += gradient
+    else:
+        grad[rows] += gradient

@@ -8,13 +8,14 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from mmsynth.field.kernels.constants import FEATURES, MAX_SAMPLES_PER_RAY
-from mmsynth.field.kernels.cpu import shading
+from mmsynth.field.kernels.cpu import learning, shading
+from mmsynth.field.kernels.cpu.learning import ChunkScratch, LightOut, TapStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
-_POOLED = 6
+_POOLED = 12
 _pool: list[tuple[Any, Any]] = []
 
 
@@ -133,3 +134,42 @@ def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
         "heads_out": tuple(heads), "heads_bias_out": (heads[0],),
     }  # fmt: skip
     return Store(slots, ShadingStore, {name: (np.float32, shape) for name, shape in shapes.items()})
+
+
+def tap_store(slots: int, units: int, width: int) -> Store[TapStore]:
+    """Of points at which a surface of a hidden layer of ``units`` times ``width`` weights is asked for its gradient."""
+    blocks = 2 * (learning.MOST_TAPPED // learning.TAPPED)  # of two surfaces apart, the last ones may be part full
+    most = 4 * learning.TAPPED * blocks
+    sizes: Sizes = {
+        "block": (np.float32, (width * most,)), "hidden": (np.float32, (units * most,)), "counts": (np.int64, (blocks,)), "used": (np.int64, (1,)),
+        **_network(units, width),
+    }  # fmt: skip
+    return Store(slots, TapStore, sizes)
+
+
+def chunk_scratch(slots: int, features: int, materials: int, hidden: int) -> Store[ChunkScratch]:
+    """Of rays with so many features, numbers of a material and units of the hidden layer of its network."""
+    f, whole = np.float32, lambda n: -(-n // shading.TILE_COLS) * shading.TILE_COLS
+    rows, columns = 2 * CHUNK, (2, CHUNK)
+    three, some = (f, (rows, 3)), 2 * shading.CHUNK
+    sizes: Sizes = {
+        "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f, (CHUNK,)),
+        "behind": (np.int64, (CHUNK,)), "mixed": (f, (rows, features)), "mixed_share": (f, (rows,)), "g_features": (f, (rows, features)),
+        "g_share": (f, (rows,)), "material": (f, (rows, materials)), "normals": three, "points": three, "directions": three, "slopes": three,
+        "g_material": (f, (rows, materials)), "g_normals": three, "mirror_share": (f, (rows,)), "g_mirror_share": (f, (rows,)),
+        "at": three, "found": three, "row_of": (np.int64, (rows,)), "shallow": (f, (rows,)), "values": (f, (4 * learning.TAPPED,)),
+        "x": (f, (some, whole(features))), "h": (f, (some, whole(hidden))), "y": (f, (some, whole(materials))),
+        "gy": (f, (some, whole(materials))), "gh": (f, (some, whole(hidden))),
+    }  # fmt: skip
+    return Store(slots, ChunkScratch, sizes)
+
+
+def light_out(slots: int, features: int, materials: int, hidden: int, lamps: int, outputs: int) -> Store[LightOut]:
+    """Of chunks of such rays, K lamps and the shader's outputs."""
+    f, whole = np.float32, lambda n: -(-n // shading.TILE_COLS) * shading.TILE_COLS
+    sizes: Sizes = {
+        "first": (f, (whole(hidden), whole(features))), "first_bias": (f, (whole(hidden),)), "second": (f, (whole(materials), whole(hidden))),
+        "second_bias": (f, (materials,)), "position": (f, (lamps, 3)), "spectrum": (f, (lamps, outputs)), "far": (f, (features,)),
+        "loss": (np.float64, ()),
+    }  # fmt: skip
+    return Store(slots, LightOut, sizes)

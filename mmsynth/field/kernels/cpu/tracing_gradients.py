@@ -14,6 +14,68 @@ from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def rays_backward(  # type: ignore[no-untyped-def]
+    begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, active, network, a_active, store
+):
+    """``trace_backward`` of the rays of a chunk, of which ``begin`` is the first in ``behind``."""
+    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
+    units = network.hidden.shape[0]
+    sdf, p_of, id_of = store.sdf, store.p_of, store.id_of
+    hidden_out, output_out = store.hidden_out, store.output_out
+    hidden_out[chunk] = np.float32(0.0)
+    output_out[chunk] = np.float32(0.0)
+    sections = store.s_count[chunk, 0]
+    sf = store.s_block[chunk]
+    at = 0
+    g_section = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
+    for i in range(count):
+        o = begin + i
+        samples, second = store.counts[chunk, i], store.second[chunk, i]
+        for k in range(samples):
+            sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] = np.float32(0.0)
+            g_section[k] = g_weight[o if k < second else behind[o]]
+        while at < sections and store.s_ray[chunk, at] == i:
+            row = o if store.s_k[chunk, at] < second else behind[o]
+            scale = np.float32(1.0) / max(shown[row], _LEAST_WEIGHT)
+            g = g_weight[row]
+            w = store.s_weight[chunk, at] * scale
+            for j in range(FEATURES * a_active):
+                place = (3 + j) * sections + at
+                gf = g_features[row, j]
+                g += gf * scale * (sf[place] - features[row, j])
+                sf[place] = gf * w
+            g_section[store.s_k[chunk, at]] = g
+            at += 1
+        # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
+        tau_sum = 0.0
+        total = 0.0
+        for k in range(samples - 1):
+            tau = max(0.0, p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1] - p_of[chunk, i * MAX_SAMPLES_PER_RAY + k])
+            total += g_section[k] * math.exp(-tau_sum) * -math.expm1(-tau)
+            tau_sum += tau
+        tau_sum = 0.0
+        for k in range(samples - 1):
+            p0, p1 = p_of[chunk, i * MAX_SAMPLES_PER_RAY + k], p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]
+            tau = p1 - p0
+            if tau > 1e-7:
+                transmittance = math.exp(-tau_sum)
+                total -= g_section[k] * transmittance * -math.expm1(-tau)
+                # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
+                d_tau = g_section[k] * transmittance * math.exp(-tau) - total
+                sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] += np.float32(d_tau * sharpness * -math.expm1(-p0))
+                sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]] -= np.float32(d_tau * sharpness * -math.expm1(-p1))
+                tau_sum += tau
+    used = 0
+    for b in range(store.rounds[chunk, 0]):
+        n = np.int64(store.sizes[chunk, b])
+        surface_block_backward(
+            store.block[chunk, used * size :], store.hidden[chunk, used * units :], sdf[chunk, used : used + n], n,
+            active, network, store.row[chunk], hidden_out[chunk], output_out[chunk],
+        )  # fmt: skip
+        used += int(n)
+
+
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def trace_backward(  # type: ignore[no-untyped-def]
     behind, g_features, g_weight, features, shown, sharpness, active, network, a_active, store
@@ -23,64 +85,13 @@ def trace_backward(  # type: ignore[no-untyped-def]
     behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
     """
     rays = behind.shape[0]
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
-    units = network.hidden.shape[0]
-    sdf, p_of, id_of = store.sdf, store.p_of, store.id_of
-    hidden_out, output_out = store.hidden_out, store.output_out  # in a parallel loop, numba would not set a tuple's arrays
-    for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        begin = np.int64(chunk) * CHUNK
-        count = min(CHUNK, rays - begin)
-        hidden_out[chunk] = np.float32(0.0)
-        output_out[chunk] = np.float32(0.0)
-        sections = store.s_count[chunk, 0]
-        sf = store.s_block[chunk]
-        at = 0
-        g_section = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
-        for i in range(count):
-            o = begin + i
-            samples, second = store.counts[chunk, i], store.second[chunk, i]
-            for k in range(samples):
-                sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] = np.float32(0.0)
-                g_section[k] = g_weight[o if k < second else behind[o]]
-            while at < sections and store.s_ray[chunk, at] == i:
-                row = o if store.s_k[chunk, at] < second else behind[o]
-                scale = np.float32(1.0) / max(shown[row], _LEAST_WEIGHT)
-                g = g_weight[row]
-                w = store.s_weight[chunk, at] * scale
-                for j in range(FEATURES * a_active):
-                    place = (3 + j) * sections + at
-                    gf = g_features[row, j]
-                    g += gf * scale * (sf[place] - features[row, j])
-                    sf[place] = gf * w
-                g_section[store.s_k[chunk, at]] = g
-                at += 1
-            # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
-            tau_sum = 0.0
-            total = 0.0
-            for k in range(samples - 1):
-                tau = max(0.0, p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1] - p_of[chunk, i * MAX_SAMPLES_PER_RAY + k])
-                total += g_section[k] * math.exp(-tau_sum) * -math.expm1(-tau)
-                tau_sum += tau
-            tau_sum = 0.0
-            for k in range(samples - 1):
-                p0, p1 = p_of[chunk, i * MAX_SAMPLES_PER_RAY + k], p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]
-                tau = p1 - p0
-                if tau > 1e-7:
-                    transmittance = math.exp(-tau_sum)
-                    total -= g_section[k] * transmittance * -math.expm1(-tau)
-                    # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
-                    d_tau = g_section[k] * transmittance * math.exp(-tau) - total
-                    sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] += np.float32(d_tau * sharpness * -math.expm1(-p0))
-                    sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]] -= np.float32(d_tau * sharpness * -math.expm1(-p1))
-                    tau_sum += tau
-        used = 0
-        for b in range(store.rounds[chunk, 0]):
-            n = np.int64(store.sizes[chunk, b])
-            surface_block_backward(
-                store.block[chunk, used * size :], store.hidden[chunk, used * units :], sdf[chunk, used : used + n], n,
-                active, network, store.row[chunk], hidden_out[chunk], output_out[chunk],
-            )  # fmt: skip
-            used += int(n)
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        chunk = np.int64(task)
+        begin = chunk * CHUNK
+        rays_backward(
+            begin, min(CHUNK, rays - begin), chunk, behind, g_features, g_weight, features, shown, sharpness, active, network, a_active,
+            store,
+        )  # fmt: skip
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
