@@ -41,7 +41,7 @@ def _stretch(x, y, z, vx, vy, vz):  # type: ignore[no-untyped-def]
 
 @jit
 def places_kernel(  # type: ignore[no-untyped-def]
-    origins, directions, distance, depth, share, given, noise, at, epsilons, points, epsilon, mirror_epsilon, rays, rows, count, asked,
+    origins, directions, distance, depth, share, given, noise, at, epsilons, points, mirroring, epsilon, mirror_epsilon, rays, rows, count, asked,
     MIRRORS: tl.constexpr, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """at: ``count`` given points, then the surfaces of all ``rows``, or beside those of ``asked`` of the ``rays``."""
@@ -54,7 +54,7 @@ def places_kernel(  # type: ignore[no-untyped-def]
         more = (k >= 0) & (k < rows)
         ray = tl.where(k < rays, k, k - rays)  # with two rows for every ray
         t = tl.load(distance + k, mask=more, other=0.0)
-        met = more & ((t > 0.0) | (tl.load(share + k, mask=more, other=0.0) > 0.0))
+        met = more & (t > 0.0)
         nx, ny, nz = 0.0 * x, 0.0 * x, 0.0 * x
     else:
         more = (k >= 0) & (k < asked)
@@ -68,6 +68,7 @@ def places_kernel(  # type: ignore[no-untyped-def]
     px, py, pz = ox + dx * t, oy + dy * t, oz + dz * t
     if MIRRORS:
         _store(points, k, px, py, pz, more)
+        tl.store(mirroring + k, tl.load(share + k, mask=met, other=0.0), mask=more)  # without a place there is no normal
     if CONTRACTED:
         norm = tl.maximum(_norm(px, py, pz), 1.0)
         factor = (2.0 - 1.0 / norm) / norm
@@ -78,7 +79,7 @@ def places_kernel(  # type: ignore[no-untyped-def]
 
 @jit
 def eikonal_kernel(  # type: ignore[no-untyped-def]
-    slopes, at, epsilons, points, distance, loss, gradient, normals, weight, shallow, count, rows,
+    slopes, at, epsilons, points, loss, gradient, normals, weight, shallow, count, rows,
     MIRRORS: tl.constexpr, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """weight: of one point. rows: of all, beside the ``count`` points of all space."""
@@ -93,7 +94,6 @@ def eikonal_kernel(  # type: ignore[no-untyped-def]
     within = _norm(px, py, pz) < 1.0
     if MIRRORS:
         mirrors = live & (k >= 0)
-        used = used & ((k < 0) | (tl.load(distance + k, mask=mirrors, other=0.0) > 0.0))
         within = within & (k < 0)
         vx, vy, vz = x, y, z
         if CONTRACTED:
@@ -132,12 +132,13 @@ def normals_backward_kernel(  # type: ignore[no-untyped-def]
 
 
 class Places(NamedTuple):
-    """Where ∇sdf is asked for, frame of the grid: at (N, 3), epsilons (N,) of the differences, 0: this one is not asked. points: (H, 3) of the
-    surfaces, normalised frame, where they mirror, else (0, 3)."""
+    """Where ∇sdf is asked for, frame of the grid: at (N, 3), epsilons (N,) of the differences, 0: this one is not asked. Of surfaces, where
+    they mirror: points (H, 3), normalised frame, share (H,) of those that have a place; else (0, 3) and (0,)."""
 
     at: Tensor
     epsilons: Tensor
     points: Tensor
+    share: Tensor
 
 
 class Slopes(NamedTuple):
@@ -153,7 +154,7 @@ def places(hits: Hits, rays: Rays, eikonal: Eikonal, extent: float, mirrors: boo
     count, rows, asked = len(eikonal.points), len(hits.share), min(len(eikonal.noise), len(rays.origins))
     total = count + (rows if mirrors else asked)
     new = lambda *shape: torch.empty(shape, device=hits.share.device)
-    out = Places(new(total, 3), new(total), new(rows if mirrors else 0, 3))
+    out = Places(new(total, 3), new(total), new(rows if mirrors else 0, 3), new(rows if mirrors else 0))
     with torch.cuda.device_of(out.at):
         places_kernel[(triton.cdiv(total, BLOCK),)](
             rays.origins, rays.directions, hits.distance, hits.depth, hits.share, eikonal.points, eikonal.noise, *out,
@@ -162,7 +163,7 @@ def places(hits: Hits, rays: Rays, eikonal: Eikonal, extent: float, mirrors: boo
     return out
 
 
-def eikonal_term(slopes: Tensor, where: Places, hits: Hits, eikonal: Eikonal, extent: float) -> Slopes:
+def eikonal_term(slopes: Tensor, where: Places, eikonal: Eikonal, extent: float) -> Slopes:
     """The eikonal term of the loss and its gradient, and normals; one launch."""
     count, mirrors = len(eikonal.points), len(where.points) > 0
     rows = len(slopes) - count
@@ -170,7 +171,7 @@ def eikonal_term(slopes: Tensor, where: Places, hits: Hits, eikonal: Eikonal, ex
     out = Slopes(torch.empty(programs, dtype=torch.float64, device=slopes.device), torch.empty_like(slopes), torch.empty_like(where.points))
     with torch.cuda.device_of(slopes):
         eikonal_kernel[(programs,)](
-            slopes, where.at, where.epsilons, where.points, hits.distance, *out, eikonal.weight / max(asked_points(where, eikonal), 1),
+            slopes, where.at, where.epsilons, where.points, *out, eikonal.weight / max(asked_points(where, eikonal), 1),
             eikonal.shallow, count, rows, mirrors, extent > 1.0, BLOCK,
         )  # fmt: skip
     return out

@@ -1,0 +1,178 @@
+"""A step of a fit in Triton: see ``learning.learn``. Shapes follow from what is given, nothing is read by the host: a CUDA graph can hold it.
+
+What a step computes are arrays that kernels hand to each other; autograd sees two operations, the trace and ∇sdf. Gradients of the shader
+and the light are rows of partial sums, one for each of their programs, and one sum.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mmsynth.field.kernels.cuda import mirroring
+from mmsynth.field.kernels.cuda.light import material, material_backward
+from mmsynth.field.kernels.cuda.shading import compare_all, programs_of
+from mmsynth.field.kernels.cuda.shared import jit, tl, triton
+from mmsynth.field.kernels.cuda.slopes import eikonal_term, normals_backward, places
+from mmsynth.field.kernels.cuda.tracing import surface_gradient, trace
+from mmsynth.field.kernels.parameters import (
+    Eikonal,
+    Gains,
+    GridTable,
+    Lamps,
+    Learned,
+    LightNetwork,
+    Measured,
+    Mirrors,
+    Opacities,
+    Rays,
+    Sampling,
+    ShadedRays,
+    ShaderWeights,
+    SurfaceNetwork,
+    View,
+)
+
+_BLOCK = 1024
+
+
+@jit
+def _mean(values, count, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    total = tl.zeros([BLOCK], tl.float32)
+    for begin in range(0, count, BLOCK):
+        i = begin + tl.arange(0, BLOCK)
+        total += tl.load(values + i, mask=i < count, other=0.0)
+    return tl.sum(total, 0) / count
+
+
+@jit
+def gains_kernel(log_gain, frame, out, count, rows, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """exp(log_gain[frame] - mean): of ``count`` numbers and ``rows`` frames."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    own = tl.load(log_gain + tl.load(frame + i, mask=i < count, other=0), mask=i < count, other=0.0)
+    tl.store(out + i, tl.exp(own - _mean(log_gain, rows, BLOCK)), mask=i < count)
+
+
+@jit
+def gains_by_frame_kernel(gain, gradient, frame, sums, count, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    g = tl.load(gradient + i, mask=i < count, other=0.0) * tl.load(gain + i, mask=i < count, other=0.0)
+    tl.atomic_add(sums + tl.load(frame + i, mask=i < count, other=0), g, mask=i < count, sem="relaxed")
+
+
+@jit
+def gains_backward_kernel(sums, gradient, rows, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    mean = _mean(sums, rows, BLOCK)
+    for begin in range(0, rows, BLOCK):
+        i = begin + tl.arange(0, BLOCK)
+        more = tl.load(sums + i, mask=i < rows, other=0.0) - mean
+        tl.store(gradient + i, tl.load(gradient + i, mask=i < rows, other=0.0) + more, mask=i < rows)
+
+
+def _gain_of(gains: Gains) -> Tensor:
+    """The factor of each number, (M,)."""
+    count = len(gains.frame)
+    out = gains.log_gain.new_empty(count)
+    with torch.cuda.device_of(out):
+        gains_kernel[(triton.cdiv(count, _BLOCK),)](gains.log_gain, gains.frame, out, count, len(gains.log_gain), _BLOCK)
+    return out
+
+
+def _gain_backward(gains: Gains, gain: Tensor, gradient: Tensor) -> None:
+    """Add to the gradient of log_gain; by atomics, whose order differs from run to run."""
+    sums = torch.zeros_like(gains.log_gain)
+    with torch.cuda.device_of(sums):
+        gains_by_frame_kernel[(triton.cdiv(len(gain), _BLOCK),)](gain, gradient, gains.frame, sums, len(gain), _BLOCK)
+        gains_backward_kernel[(1,)](sums, _gradient(gains.log_gain), len(sums), _BLOCK)
+
+
+def _gradient(tensor: Tensor) -> Tensor:
+    if tensor.grad is None:
+        tensor.grad = torch.zeros_like(tensor)
+    return tensor.grad
+
+
+def weights_of(shader: ShaderWeights, far_light: Tensor, light: LightNetwork) -> list[Tensor]:
+    """The weights whose gradients ``learn_all`` sums, in that order; those of the light where there are lamps."""
+    return [*shader, far_light, *(light[:6] if len(light.used) else ())]
+
+
+def learn_all(
+    grid: GridTable,
+    network: SurfaceNetwork,
+    appearance: GridTable,
+    states: Tensor,
+    shader: ShaderWeights,
+    light: LightNetwork,
+    far_light: Tensor,
+    rays: Rays,
+    view: View,
+    measured: Measured,
+    gains: Gains,
+    opacities: Opacities,
+    eikonal: Eikonal,
+    sampling: Sampling,
+    gradient: Tensor,
+) -> Learned:
+    """``learn``, of which the gradients of ``weights_of`` are added to ``gradient``, one after the other, and the others to their ``grad``.
+
+    Returns:
+        the loss (n,) float64, to be summed.
+    """
+    with torch.enable_grad():
+        hits = trace(grid, network, appearance, states, rays, sampling)
+    features, share, shines = hits.features.detach(), hits.share.detach(), len(light.used) > 0
+    where = places(hits, rays, eikonal, grid.extent, shines)
+    with torch.enable_grad():
+        slopes = surface_gradient(where.at, where.epsilons, grid, network)
+    found = eikonal_term(slopes.detach(), where, eikonal, grid.extent)
+    gain = _gain_of(gains) if len(gains.log_gain) else None
+    mirrored = None
+    if shines:
+        raw = material(light, features)
+        lamps, mirrors = Lamps(light.position, light.log_spectrum), Mirrors(raw, found.normals, where.points, rays.directions, where.share)
+        mirrored = mirroring.launch(lamps, light.used, True, mirrors, hits.behind, measured)
+    partial = features.new_empty(programs_of(len(rays.origins)), len(gradient))
+    seen = ShadedRays(features, share, hits.behind, rays.directions, view.degrees, view.trains_geometry)
+    of_shader = sum(w.numel() for w in (*shader, far_light))
+    compared = compare_all(shader, seen, measured, gain, mirrored, True, far_light, opacities, partial)
+    if shines:
+        of_light, of_material, of_normals = partial[:, of_shader:], torch.empty_like(raw), torch.empty_like(found.normals)
+        of_lamps = of_light[:, sum(w.numel() for w in light[:4]) :]
+        backward = compared.mirrored, view.trains_geometry, of_material, of_normals, compared.share, of_lamps
+        mirroring.launch(lamps, light.used, True, mirrors, hits.behind, measured, backward, add=True)
+        material_backward(light, features, of_material, compared.features, of_light)
+        normals_backward(slopes.detach(), where, of_normals, found.gradient, grid.extent)
+    if gain is not None:
+        _gain_backward(gains, gain, compared.gain)
+    gradient += partial.sum(0)
+    torch.autograd.backward([hits.features, hits.share, slopes], [compared.features, compared.share, found.gradient])
+    return Learned(torch.cat([compared.loss, found.loss]), compared.squared, hits.samples)
+
+
+def learn(
+    grid: GridTable,
+    network: SurfaceNetwork,
+    appearance: GridTable,
+    states: Tensor,
+    shader: ShaderWeights,
+    light: LightNetwork,
+    far_light: Tensor,
+    rays: Rays,
+    view: View,
+    measured: Measured,
+    gains: Gains,
+    opacities: Opacities,
+    eikonal: Eikonal,
+    sampling: Sampling,
+) -> Learned:
+    """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
+    weights = weights_of(shader, far_light, light)
+    gradient = rays.origins.new_zeros(sum(w.numel() for w in weights))
+    found = learn_all(
+        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, gradient
+    )
+    for weight, part in zip(weights, gradient.split([w.numel() for w in weights]), strict=True):
+        if weight.numel():
+            _gradient(weight).add_(part.view_as(weight))
+    return found._replace(loss=found.loss.sum().float())
