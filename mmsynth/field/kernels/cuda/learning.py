@@ -14,7 +14,8 @@ from mmsynth.field.kernels.cuda.light import material, material_backward
 from mmsynth.field.kernels.cuda.shading import compare_all, programs_of
 from mmsynth.field.kernels.cuda.shared import jit, tl, triton
 from mmsynth.field.kernels.cuda.slopes import eikonal_term, normals_backward, places
-from mmsynth.field.kernels.cuda.tracing import surface_gradient, trace
+from mmsynth.field.kernels.cuda.surface import surface_gradient
+from mmsynth.field.kernels.cuda.tracing import trace
 from mmsynth.field.kernels.parameters import (
     Eikonal,
     Gains,

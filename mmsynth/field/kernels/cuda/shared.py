@@ -1,4 +1,4 @@
-"""What the Triton kernels share: the compiler, constants, and whether they can run on this machine."""
+"""What the Triton kernels share: the compiler, constants, small device functions, and whether they can run on this machine."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mmsynth.field.kernels import constants
 
@@ -15,14 +16,15 @@ try:
 except ImportError:
     triton = tl = None
 
-
-# numbers of which kernels are not compiled anew where they happen to be 1 or multiples of 16
-_UNSPECIALIZED = ["count", "rays", "rows", "levels", "active", "k", "grid", "bright", "bisections", "stride", "lamps", "asked"]
+NEWEST = (3, 7)  # of triton, not included: from here on untested
+_PROGRAMS_PER_CORE = 4  # of a persistent kernel, for each multiprocessor
+# numbers that a kernel must not be compiled anew for where they happen to be 1 or multiples of 16
+_PLAIN = ["count", "rays", "rows", "levels", "active", "grid", "width", "stride", "size", "bright", "bisections", "lamps", "asked"]
 
 
 def jit(function: Any) -> Any:
     """``triton.jit`` that compiles once, not anew for sizes that happen to be 1 or multiples of 16; a no-op without triton."""
-    return function if triton is None else triton.jit(do_not_specialize=_UNSPECIALIZED)(function)
+    return function if triton is None else triton.jit(do_not_specialize=_PLAIN)(function)
 
 
 def constant(value: float) -> Any:
@@ -33,9 +35,24 @@ def constant(value: float) -> Any:
 SOLID, OUTSIDE = constant(constants.SOLID), constant(constants.OUTSIDE)
 ALONG_FACE, NO_CROSSING = constant(constants.ALONG_FACE), constant(constants.NO_CROSSING)
 FACE_OVERSHOOT = constant(constants.FACE_OVERSHOOT)
+LEAST_ADVANCE, LONGEST_STEP = constant(constants.LEAST_ADVANCE), constant(constants.LONGEST_STEP)
+SOFT_SURFACE, LAYER_GAP = constant(constants.SOFT_SURFACE), constant(constants.LAYER_GAP)
+MAX_SAMPLES = constant(constants.MAX_SAMPLES_PER_RAY)
+LEAST_WEIGHT = constant(constants.LEAST_WEIGHT)
 FIRST_FEATURE_ROW = constant(constants.FIRST_FEATURE_ROW)
 HASH_Y, HASH_Z = constant(constants.HASH_PRIMES[1]), constant(constants.HASH_PRIMES[2])
-HUBER, LEAST_WEIGHT = constant(constants.HUBER_DELTA), constant(constants.LEAST_WEIGHT)
+HUBER = constant(constants.HUBER_DELTA)
+COLUMNS = constant(16)  # features that are looked up together, the least depth of a matrix product on tensor cores
+
+
+def programs(device: torch.device) -> int:
+    """Programs of a persistent kernel: sums of as many parts are added in order, so a result depends on the kind of GPU alone."""
+    return 2 if device.type == "cpu" else _PROGRAMS_PER_CORE * torch.cuda.get_device_properties(device).multi_processor_count
+
+
+def scalar(value: float | Tensor, device: torch.device) -> Tensor:
+    """A number that kernels read from memory, float64 (): one that changes in a captured graph is a tensor already."""
+    return value if isinstance(value, Tensor) else torch.full((), value, dtype=torch.float64, device=device)
 
 
 @jit
@@ -77,6 +94,27 @@ def sum_of_pair(values, PAIRS: tl.constexpr):  # type: ignore[no-untyped-def]
     """(2 PAIRS,) → the sum of neighbours, at both of them."""
     both = tl.sum(tl.reshape(values, (PAIRS, 2)), 1)
     return tl.reshape(tl.broadcast_to(both[:, None], (PAIRS, 2)), (2 * PAIRS,))
+
+
+@jit
+def contracted(x, y, z, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """A position in the frame of the grid, and its distance from the centre before contraction, at least 1."""
+    reach = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
+    if CONTRACTED:
+        factor = (2.0 - 1.0 / reach) / reach
+        x, y, z = x * factor, y * factor, z * factor
+    return x, y, z, reach
+
+
+@jit
+def back_to_world(x, y, z, gx, gy, gz, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Gradient to a position from the gradient to its contraction."""
+    if CONTRACTED:
+        r = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
+        factor = (2.0 - 1.0 / r) / r  # 1 where r is, and the change of it 0
+        change = (2.0 - 2.0 * r) / (r * r * r * r) * (x * gx + y * gy + z * gz)
+        gx, gy, gz = factor * gx + change * x, factor * gy + change * y, factor * gz + change * z
+    return gx, gy, gz
 
 
 @jit

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mmsynth.field.kernels.cuda.shared import jit, position, tl, triton
+from mmsynth.field.kernels.cuda.shared import back_to_world, contracted, jit, position, tl, triton
 from mmsynth.field.kernels.parameters import Eikonal, Hits, Rays
 
 BLOCK = 128
@@ -24,19 +24,6 @@ def _store(to, i, x, y, z, mask):  # type: ignore[no-untyped-def]
 @jit
 def _norm(x, y, z):  # type: ignore[no-untyped-def]
     return tl.sqrt(x * x + y * y + z * z)
-
-
-@jit
-def _stretch(x, y, z, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """The contraction's Jacobian, which is symmetric, at points of the normalised frame: see ``reference.contracted_velocity``."""
-    norm = tl.maximum(_norm(x, y, z), 1.0)
-    x, y, z = x / norm, y / norm, z / norm
-    across = (2.0 * norm - 1.0) / (norm * norm)
-    along = (x * vx + y * vy + z * vz) * (1.0 / (norm * norm) - across)
-    beyond = norm > 1.0
-    vx = tl.where(beyond, vx * across + x * along, vx)
-    vy = tl.where(beyond, vy * across + y * along, vy)
-    return vx, vy, tl.where(beyond, vz * across + z * along, vz)
 
 
 @jit
@@ -69,10 +56,7 @@ def places_kernel(  # type: ignore[no-untyped-def]
     if MIRRORS:
         _store(points, k, px, py, pz, more)
         tl.store(mirroring + k, tl.load(share + k, mask=met, other=0.0), mask=more)  # without a place there is no normal
-    if CONTRACTED:
-        norm = tl.maximum(_norm(px, py, pz), 1.0)
-        factor = (2.0 - 1.0 / norm) / norm
-        px, py, pz = px * factor, py * factor, pz * factor
+    px, py, pz, _ = contracted(px, py, pz, CONTRACTED)
     _store(at, i, tl.where(free, x, px + nx), tl.where(free, y, py + ny), tl.where(free, z, pz + nz), free | more)
     tl.store(epsilons + i, tl.where(met, mirror_epsilon if MIRRORS else epsilon, far), mask=free | more)
 
@@ -95,10 +79,8 @@ def eikonal_kernel(  # type: ignore[no-untyped-def]
     if MIRRORS:
         mirrors = live & (k >= 0)
         within = within & (k < 0)
-        vx, vy, vz = x, y, z
-        if CONTRACTED:
-            qx, qy, qz = position(points, k, mirrors)
-            vx, vy, vz = _stretch(qx, qy, qz, x, y, z)
+        qx, qy, qz = position(points, k, mirrors)
+        vx, vy, vz = back_to_world(qx, qy, qz, x, y, z, CONTRACTED)
         norm = tl.maximum(_norm(vx, vy, vz), 1e-12)
         _store(normals, k, vx / norm, vy / norm, vz / norm, mirrors)
     factor = tl.where(used, weight * tl.where((off < 0.0) & within, shallow, 1.0), 0.0)
@@ -117,15 +99,13 @@ def normals_backward_kernel(  # type: ignore[no-untyped-def]
     live = k < rows
     x, y, z = position(slopes, count + k, live)
     px, py, pz = position(points, k, live)
-    if CONTRACTED:
-        x, y, z = _stretch(px, py, pz, x, y, z)
+    x, y, z = back_to_world(px, py, pz, x, y, z, CONTRACTED)
     norm = tl.maximum(_norm(x, y, z), 1e-12)
     x, y, z = x / norm, y / norm, z / norm
     gx, gy, gz = position(g_normals, k, live)
     along = gx * x + gy * y + gz * z
     gx, gy, gz = (gx - along * x) / norm, (gy - along * y) / norm, (gz - along * z) / norm
-    if CONTRACTED:
-        gx, gy, gz = _stretch(px, py, pz, gx, gy, gz)
+    gx, gy, gz = back_to_world(px, py, pz, gx, gy, gz, CONTRACTED)  # the contraction's Jacobian is symmetric
     some = live & ((gx != 0.0) | (gy != 0.0) | (gz != 0.0))  # what is not met has no slope either
     bx, by, bz = position(gradient, count + k, some)
     _store(gradient, count + k, bx + gx, by + gy, bz + gz, some)
