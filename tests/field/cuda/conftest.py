@@ -5,9 +5,13 @@ Whether Triton compiles or interprets is decided when it is first imported. So t
 """
 
 import os
+import sys
+from pathlib import Path
 
 import pytest
 import torch
+
+sys.path.append(str(Path(__file__).parents[1]))  # cases of the CPU's tests are those of Triton's
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 

@@ -17,17 +17,7 @@ from mmsynth.field.kernels.cpu import mirroring, shading
 from mmsynth.field.kernels.cpu.blocks import scatter_block, surface_block, surface_block_backward
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, contract, find_sections, march_rays, velocity
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
-from mmsynth.field.kernels.cpu.shading import (
-    Layers,
-    add_product,
-    clear,
-    clear_gradients,
-    compare_rays,
-    first_at,
-    layer,
-    layer_backward,
-    padded,
-)
+from mmsynth.field.kernels.cpu.shading import Layers, add_product, clear, clear_gradients, compare_rays, first_at, layer, layer_backward, padded
 from mmsynth.field.kernels.cpu.tasks import take
 from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward
 from mmsynth.field.kernels.learning import TAPS

@@ -313,17 +313,12 @@ def learn(
     chunks, threads = -(-count // CHUNK), get_num_threads()
     tasks = chunks + -(-points // learning.POINTS)
     units, width = network.hidden.shape
-    features, hidden = (
-        light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions),
-        len(light.first),
-    )
+    features, hidden = light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions), len(light.first)
     used = light.used.numpy()
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
     lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining = LightNetwork(
-        *(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:])
-    )
+    shining = LightNetwork(*(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:]))
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)

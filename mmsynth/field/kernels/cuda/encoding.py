@@ -91,9 +91,7 @@ def _weight(x, y, z, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
 def encode(ux, uy, uz, live, table, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
     """Features at unit positions of the levels from ``first`` on, (BLOCK, COLUMNS); zeros where not ``live`` and for an unused level."""
     LEVELS: tl.constexpr = COLUMNS // FEATURES
-    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(
-        ux, uy, uz, resolutions, offsets, first, active, LEVELS
-    )
+    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(ux, uy, uz, resolutions, offsets, first, active, LEVELS)
     feature = tl.arange(0, FEATURES)[None, None, :]
     here = (live[:, None] & used)[:, :, None]
     value = tl.zeros([ux.shape[0], LEVELS, FEATURES], tl.float32)
@@ -108,9 +106,7 @@ def encode(ux, uy, uz, live, table, resolutions, offsets, first, active, FEATURE
 def scatter(ux, uy, uz, g, live, out, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
     """Add gradients (BLOCK, COLUMNS) of ``encode``'s features to the table's."""
     LEVELS: tl.constexpr = COLUMNS // FEATURES
-    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(
-        ux, uy, uz, resolutions, offsets, first, active, LEVELS
-    )
+    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(ux, uy, uz, resolutions, offsets, first, active, LEVELS)
     feature = tl.arange(0, FEATURES)[None, None, :]
     g = tl.reshape(g, [ux.shape[0], LEVELS, FEATURES])
     # NaN != 0, so that one is passed on

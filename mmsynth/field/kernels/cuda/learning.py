@@ -1,4 +1,4 @@
-"""A step of a fit in Triton: see ``learning.learn``. Shapes follow from what is given, nothing is read by the host: a CUDA graph can hold it.
+"""A step of a fit in Triton: see ``learning.learn``. Shapes follow from what is given, the host reads nothing: a CUDA graph can hold it.
 
 What a step computes are arrays that kernels hand to each other; autograd sees two operations, the trace and ∇sdf. Gradients of the shader
 and the light are rows of partial sums, one for each of their programs, and one sum.

@@ -132,7 +132,9 @@ def march_kernel(  # type: ignore[no-untyped-def]
         depth = tl.where(fresh, 0.0, depth)
         # lanes without a ray are where their last one ended, and stay
         t = tl.where(ray < rays, t, far)
-        t, x, y, z, reach, speed, state = _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, states, grid, half, extent, step, CONTRACTED)
+        t, x, y, z, reach, speed, state = _advance(
+            ox, oy, oz, dx, dy, dz, t, far, jitter, states, grid, half, extent, step, CONTRACTED
+        )
         met = (ray < rays) & (t < far)
         f = distance(x, y, z, met, table, resolutions, offsets, active, scale, hidden, width, output, inner, outer, UNITS, HIDDEN, FEATURES)
         later = met & (k > 0)

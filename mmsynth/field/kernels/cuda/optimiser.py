@@ -38,28 +38,27 @@ def adam_kernel(  # type: ignore[no-untyped-def]
 
 @jit
 def guarded_adam_kernel(  # type: ignore[no-untyped-def]
-    parameter, gradient, first, second, rates, kinds, factors, steps, beta1, beta2, epsilon, count,
+    parameter, gradient, first, second, rates, kinds, factors, steps, beta1, beta2, log_beta1, log_beta2, epsilon, count,
     KIND: tl.constexpr, SPARSE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Rates of the step are rates × factors[kind]. KIND: of all numbers, which have the one rate; -1: each has its own rate and kind."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = i < count
     good = tl.load(steps) != 0
-    number = tl.load(steps + 1).to(tl.float64)
+    number = tl.load(steps + 1).to(tl.float32)
     if KIND < 0:
         rate = tl.load(rates + i, mask=live, other=0.0) * tl.load(factors + tl.load(kinds + i, mask=live, other=0).to(tl.int32))
     else:
         rate = tl.load(rates) * tl.load(factors + KIND)
-    one = (1.0 - tl.exp(number * tl.log(beta1.to(tl.float64)))).to(tl.float32)
-    two = (1.0 - tl.exp(number * tl.log(beta2.to(tl.float64)))).to(tl.float32)
+    one, two = 1.0 - tl.exp(number * log_beta1), 1.0 - tl.exp(number * log_beta2)
     _move(parameter, gradient, first, second, i, live & good, rate / one, 1.0 / tl.sqrt(two), beta1, beta2, epsilon, SPARSE)
     tl.store(gradient + i, 0.0, mask=live)
 
 
 @jit
 def check_kernel(loss, rows, gradient, count, samples, steps, sums, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Whether loss and gradients are finite: steps[0]; steps[1]: how many were so. sums: of steps, of those that were not so, of samples and
-    of the losses of good steps."""
+    """Whether loss and gradients are finite: steps[0]; steps[1]: how often they were. sums: of steps, of those that were not, of samples
+    and of the losses of good steps."""
     k = tl.arange(0, BLOCK)
     total = tl.zeros([BLOCK], tl.float64)
     for begin in range(0, rows, BLOCK):
@@ -106,7 +105,7 @@ def guarded_adam(
         each = isinstance(kinds, Tensor)
         with torch.cuda.device_of(parameter), torch.no_grad():
             guarded_adam_kernel[(triton.cdiv(count, _BLOCK),)](
-                parameter, gradient, *moments, rates, kinds if each else rates, factors, steps, *betas, epsilon, count,
+                parameter, gradient, *moments, rates, kinds if each else rates, factors, steps, *betas, *map(math.log, betas), epsilon, count,
                 -1 if each else kinds, sparse, _BLOCK,
             )  # fmt: skip
 

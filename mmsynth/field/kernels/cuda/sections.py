@@ -8,6 +8,7 @@ from __future__ import annotations
 from mmsynth.field.kernels.cuda.shared import LAYER_GAP, LEAST_WEIGHT, MAX_SAMPLES, contracted, jit, position, tl
 
 
+
 @jit
 def _is_dense(tau):  # type: ignore[no-untyped-def]
     """Sections of less are passed over."""

@@ -28,7 +28,8 @@ def _norm(x, y, z):  # type: ignore[no-untyped-def]
 
 @jit
 def places_kernel(  # type: ignore[no-untyped-def]
-    origins, directions, distance, depth, share, given, noise, at, epsilons, points, mirroring, epsilon, mirror_epsilon, rays, rows, count, asked,
+    origins, directions, distance, depth, share, given, noise, at, epsilons, points, mirroring,
+    epsilon, mirror_epsilon, rays, rows, count, asked,
     MIRRORS: tl.constexpr, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """at: ``count`` given points, then the surfaces of all ``rows``, or beside those of ``asked`` of the ``rays``."""
@@ -122,7 +123,7 @@ class Places(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Of ∇sdf at ``Places``: loss (programs,) float64 of the eikonal term, to be summed; gradient (N, 3) of that; normals (H, 3) of mirrors."""
+    """Of ∇sdf at ``Places``: loss (programs,) float64 of the eikonal term, to be summed; its gradient (N, 3); normals (H, 3) of mirrors."""
 
     loss: Tensor
     gradient: Tensor

@@ -14,18 +14,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.field.kernels.cuda.encoding import encode, scatter, slope, to_frame, unit_cube
-from mmsynth.field.kernels.cuda.shared import (
-    COLUMNS,
-    FIRST_FEATURE_ROW,
-    back_to_world,
-    constant,
-    contracted,
-    jit,
-    position,
-    programs,
-    tl,
-    triton,
-)
+from mmsynth.field.kernels.cuda.shared import COLUMNS, FIRST_FEATURE_ROW, back_to_world, constant, contracted, jit, position, programs, tl, triton
 from mmsynth.field.kernels.parameters import GridTable, SurfaceNetwork
 
 BLOCK = 64  # positions per program
@@ -93,16 +82,7 @@ def _tap(positions, epsilons, stride, i, count):  # type: ignore[no-untyped-def]
     x, y, z = position(positions, i // 4, live)
     sx, sy, sz = _signs(i)
     shift = epsilon / _ROOT3
-    return (
-        x + sx * shift,
-        y + sy * shift,
-        z + sz * shift,
-        sx,
-        sy,
-        sz,
-        tl.where(live, _ROOT3 / (4.0 * tl.where(live, epsilon, 1.0)), 0.0),
-        live,
-    )
+    return x + sx * shift, y + sy * shift, z + sz * shift, sx, sy, sz, tl.where(live, _ROOT3 / (4.0 * tl.where(live, epsilon, 1.0)), 0.0), live
 
 
 @jit

@@ -40,9 +40,7 @@ class _Traced(NamedTuple):
 def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
     """See ``reference.trace``; float32. Hits have 2 R rows, R + r what is behind the nearest surface of ray r, zeros where nothing is.
     Differentiable in origins, directions, weights, and, in place, the tables. ``sharpness`` and ``step`` may be float64 tensors ()."""
-    return Hits(
-        *_Trace.apply(rays.origins, rays.directions, network.hidden, network.output, grid, network, appearance, states, rays, sampling)
-    )
+    return Hits(*_Trace.apply(rays.origins, rays.directions, network.hidden, network.output, grid, network, appearance, states, rays, sampling))
 
 
 class _Trace(torch.autograd.Function):
@@ -94,9 +92,7 @@ class _Trace(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(
-        ctx: Any, g_features: Tensor | None, g_share: Tensor | None, _0: None, _1: None, g_opacity: Tensor | None, *_: None
-    ) -> Any:
+    def backward(ctx: Any, g_features: Tensor | None, g_share: Tensor | None, _0: None, _1: None, g_opacity: Tensor | None, *_: None) -> Any:
         (grid, network, appearance), t = ctx.parameters, ctx.traced
         origins, directions, hidden, output = ctx.saved_tensors
         count, device = len(origins), origins.device
