@@ -20,13 +20,14 @@ from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
-from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, in_order, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
@@ -76,14 +77,24 @@ class Trainer:
     for any interruption; with ``budget`` it follows the clock.
     """
 
-    def __init__(self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        steps: int | None,
+        budget: float | None,
+        seed: int,
+        device: str,
+        on_load: OnLoad | None = None,
+    ) -> None:
         if (steps is None) == (budget is None):
             raise InputError("fit: give either a number of steps or a time budget, not both.")
         self.recipe, self.steps, self.budget, self.seed = recipe, steps, budget, seed
         self.device = torch.device(device)
         torch.manual_seed(seed)
-        self.measurements: dict[str, Measurements] = load_measurements(scene)
-        self.needs: Needs = assess(scene, self.measurements, recipe, seed, expected_rays(recipe, steps, budget))
+        rays_to_come = expected_rays(recipe, steps, budget)
+        self.measurements: Measurements = load_measurements(scene, rays_to_come=rays_to_come, device=self.device, on_load=on_load)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come)
         sensors = {n: m.sensor for n, m in self.measurements.items()}
         radiance_scale = {n: m.radiance_scale for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
@@ -103,9 +114,9 @@ class Trainer:
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.importance = Importance({n: m.pixels.size for n, m in self.measurements.items()}, recipe.sampling.evenly)
+        self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
-        self.has_empty = any(m.empty is not None for m in self.measurements.values())
+        self.has_empty = self.measurements.empty is not None
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -143,7 +154,7 @@ class Trainer:
         batch = self._draw(random)
         loss, squared, samples = self._loss(batch, sampling, generator)
         if self.has_empty:
-            opacity, more = self._opacity_outside(random, sampling, generator)
+            opacity, more = self._opacity_outside(random, sampling)
             loss, samples = loss + self.recipe.loss.alpha_weight * opacity.square().mean(), samples + more
         wrong = self._differentiate(loss)
         if wrong is not None:
@@ -195,23 +206,19 @@ class Trainer:
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
 
     def _draw(self, random: np.random.Generator) -> Batch:
-        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.device, self.importance)
+        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.importance.selection)
 
     def _rays(self) -> dict[str, int]:
         """Of a step, how many of each modality."""
         total = sum(self.needs.share.values())
         return {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
 
-    def _opacity_outside(
-        self, random: np.random.Generator, sampling: kernels.Sampling, generator: torch.Generator
-    ) -> tuple[torch.Tensor, int]:
+    def _opacity_outside(self, random: np.random.Generator, sampling: kernels.Sampling) -> tuple[torch.Tensor, int]:
         """Opacity of some rays outside the object's masks, (R,), which should be 0, and the samples that it took. Their colours are
         those of a background that is not the object's, or of a picture that was painted white there: they are not looked at."""
         rays = {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}
-        origins, directions = draw_empty(self.measurements, rays, random, self.device)
-        jitter = torch.rand(len(origins), generator=generator).to(self.device)
-        field = self.field
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
+        batch, field = draw_empty(self.measurements, rays, random), self.field
+        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, batch.jitter, sampling)
         return hits.opacity, int(hits.samples)
 
     def _differentiate(self, loss: torch.Tensor) -> str | None:
@@ -238,8 +245,7 @@ class Trainer:
     def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor, int]:
         """The loss, the squared residual of each number (M,), and the samples that they took."""
         recipe, field = self.recipe, self.field
-        jitter = torch.rand(len(batch.origins), generator=generator).to(self.device)
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, batch.jitter, sampling)
         degrees = batch.per_ray(field.view_dependence)
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains_geometry = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
@@ -252,7 +258,7 @@ class Trainer:
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)
             off = batch.ray_weight * (hits.opacity - batch.alpha).square()
-            loss = loss + recipe.loss.alpha_weight * off[known].sum() / len(jitter)
+            loss = loss + recipe.loss.alpha_weight * off[known].sum() / len(batch.jitter)
         elif self.needs.black_background:
             m = batch.measured
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
@@ -264,11 +270,12 @@ class Trainer:
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
-        out = {}
+        out, residuals = {}, []
         for name, (rays, numbers) in batch.parts.items():
             found = squared[numbers].reshape(rays.stop - rays.start, -1).mean(1)
             out[name] = float((batch.ray_weight[rays] * found).mean())
-            self.importance.learn(name, batch.pixels[name], (found.sqrt() / self.measurements[name].radiance_scale).cpu().numpy())
+            residuals.append(found.sqrt() / self.measurements[name].radiance_scale)
+        self.importance.learn(batch.tile, torch.cat(residuals))
         return out
 
     @property
@@ -284,7 +291,7 @@ class Trainer:
         return self._gain()[batch.frame] if self._has_gains else None
 
     def _look(self, sampling: kernels.Sampling, rays: dict[str, int], random: np.random.Generator) -> RayJacobian:
-        batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
+        batch = draw(self.measurements, self.field.shader.columns, rays, random)
         far_light = self.state.decided is not None
         return ray_residuals(self.field, batch, batch.per_ray(self.field.view_dependence), self._gain_of(batch), far_light, sampling)
 
@@ -346,7 +353,7 @@ class Trainer:
         """Exposure of each training frame relative to the mean, per modality; empty when no gains were needed."""
         if not self._has_gains:
             return {}
-        order = in_order(self.measurements)
+        order = self.measurements.order
         parts = self._gain().detach().cpu().split([len(self.measurements[n].origins) for n in order])
         return {n: part.tolist() for n, part in zip(order, parts, strict=True)}
 

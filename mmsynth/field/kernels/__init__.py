@@ -1,16 +1,16 @@
 """The operations that a field is made of: tensors in, tensors out. The back end follows the tensors.
 
 numba for float32 on the CPU (``cpu``), Triton for float32 on a GPU where it runs (``cuda``), torch elsewhere. ``reference``, with
-``shading`` and ``mirroring``, defines every operation; docstrings are there. Each back end has all of them under the same names: its own,
-the reference's, or the reference's made of its own parts. ``parameters`` says what they take, ``constants`` what they agree on.
-README.md says how to add one.
+``shading``, ``mirroring`` and ``drawing``, defines every operation; docstrings are there. Each back end has all of them under the same
+names: its own, the reference's, or the reference's made of its own parts. ``parameters`` says what they take, ``constants`` what they
+agree on. README.md says how to add one.
 """
 
 from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 import torch
@@ -21,7 +21,10 @@ from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
     AdamStep,
+    Cameras,
+    Drawn,
     Eikonal,
+    Frames,
     Gains,
     GridTable,
     Hits,
@@ -30,10 +33,12 @@ from mmsynth.field.kernels.parameters import (
     LightNetwork,
     Measured,
     Mirrors,
+    Modalities,
     Opacities,
     Rays,
     Samples,
     Sampling,
+    Selection,
     ShadedRays,
     ShaderWeights,
     SurfaceNetwork,
@@ -49,6 +54,9 @@ __all__ = [
     "AdamStep",
     "Eikonal",
     "Gains",
+    "Cameras",
+    "Drawn",
+    "Frames",
     "GridTable",
     "Hits",
     "Lamps",
@@ -57,10 +65,12 @@ __all__ = [
     "Measured",
     "Mirrors",
     "Opacities",
+    "Modalities",
     "Rays",
     "Reflection",
     "Samples",
     "Sampling",
+    "Selection",
     "ShadedRays",
     "ShaderWeights",
     "SurfaceNetwork",
@@ -70,11 +80,13 @@ __all__ = [
     "compare",
     "contract",
     "contracted_velocity",
+    "draw",
     "hash_encode",
     "intensity",
     "learn",
     "march",
     "mirror",
+    "odds",
     "photometric",
     "predict",
     "radiance",
@@ -168,6 +180,18 @@ def learn(
     return _backend(rays.origins).learn(
         grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling
     )
+
+
+def draw(
+    frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
+) -> Drawn:
+    """Random photosites, the rays through them, and what was measured along these."""
+    return _backend(frames.origin).draw(frames, cameras, modalities, selection, rays, key)
+
+
+def odds(residual: Tensor, count: Tensor, first_tile: Tensor, evenly: float) -> tuple[Tensor, Tensor]:
+    """How often each tile of the frames is drawn, and the weights of its rays."""
+    return _backend(residual).odds(residual, count, first_tile, evenly)
 
 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:

@@ -26,7 +26,9 @@ from mmsynth.field.kernels.constants import (
     SOFT_SURFACE,
     SOLID,
 )
-from mmsynth.field.kernels.mirroring import mirror as mirror  # this and ``shading`` are of the reference, too
+from mmsynth.field.kernels.drawing import draw as draw  # this, ``mirroring`` and ``shading`` are of the reference, too
+from mmsynth.field.kernels.drawing import odds as odds
+from mmsynth.field.kernels.mirroring import mirror as mirror
 from mmsynth.field.kernels.parameters import (
     AdamStep,
     GridTable,

@@ -105,8 +105,8 @@ def guarded_adam(
         each = isinstance(kinds, Tensor)
         with torch.cuda.device_of(parameter), torch.no_grad():
             guarded_adam_kernel[(triton.cdiv(count, _BLOCK),)](
-                parameter, gradient, *moments, rates, kinds if each else rates, factors, steps, *betas, *map(math.log, betas), epsilon, count,
-                -1 if each else kinds, sparse, _BLOCK,
+                parameter, gradient, *moments, rates, kinds if each else rates, factors, steps, *betas, *map(math.log, betas), epsilon,
+                count, -1 if each else kinds, sparse, _BLOCK,
             )  # fmt: skip
 
 
