@@ -93,11 +93,6 @@ def _gradient(tensor: Tensor) -> Tensor:
     return tensor.grad
 
 
-def weights_of(shader: ShaderWeights, far_light: Tensor, light: LightNetwork) -> list[Tensor]:
-    """The weights whose gradients ``learn_all`` sums, in that order; those of the light where there are lamps."""
-    return [*shader, far_light, *(light[:6] if len(light.used) else ())]
-
-
 def learn_all(
     grid: GridTable,
     network: SurfaceNetwork,
@@ -113,9 +108,13 @@ def learn_all(
     opacities: Opacities,
     eikonal: Eikonal,
     sampling: Sampling,
-    gradient: Tensor,
+    of_shader: Tensor,
+    of_light: Tensor,
 ) -> Learned:
-    """``learn``, of which the gradients of ``weights_of`` are added to ``gradient``, one after the other, and the others to their ``grad``.
+    """``learn``, of which gradients are added to the ``grad`` of what is left, and those of
+
+        of_shader: the shader's weights and the far light, one after the other, as they are given, to this array (W,).
+        of_light: the first six parts of the light, one after the other, to this one (V,), empty without lamps.
 
     Returns:
         the loss (n,) float64, to be summed.
@@ -133,20 +132,22 @@ def learn_all(
         raw = material(light, features)
         lamps, mirrors = Lamps(light.position, light.log_spectrum), Mirrors(raw, found.normals, where.points, rays.directions, where.share)
         mirrored = mirroring.launch(lamps, light.used, True, mirrors, hits.behind, measured)
-    partial = features.new_empty(programs_of(len(rays.origins)), len(gradient))
+    partial = features.new_empty(programs_of(len(rays.origins)), len(of_shader) + len(of_light))
     seen = ShadedRays(features, share, hits.behind, rays.directions, view.degrees, view.trains_geometry)
-    of_shader = sum(w.numel() for w in (*shader, far_light))
     compared = compare_all(shader, seen, measured, gain, mirrored, True, far_light, opacities, partial)
     if shines:
-        of_light, of_material, of_normals = partial[:, of_shader:], torch.empty_like(raw), torch.empty_like(found.normals)
-        of_lamps = of_light[:, sum(w.numel() for w in light[:4]) :]
+        own, of_material, of_normals = partial[:, len(of_shader) :], torch.empty_like(raw), torch.empty_like(found.normals)
+        of_lamps = own[:, sum(w.numel() for w in light[:4]) :]
         backward = compared.mirrored, view.trains_geometry, of_material, of_normals, compared.share, of_lamps
         mirroring.launch(lamps, light.used, True, mirrors, hits.behind, measured, backward, add=True)
-        material_backward(light, features, of_material, compared.features, of_light)
+        material_backward(light, features, of_material, compared.features, own)
         normals_backward(slopes.detach(), where, of_normals, found.gradient, grid.extent)
     if gain is not None:
         _gain_backward(gains, gain, compared.gain)
-    gradient += partial.sum(0)
+    whole = partial.sum(0)
+    of_shader += whole[: len(of_shader)]
+    if shines:
+        of_light += whole[len(of_shader) :]
     torch.autograd.backward([hits.features, hits.share, slopes], [compared.features, compared.share, found.gradient])
     return Learned(torch.cat([compared.loss, found.loss]), compared.squared, hits.samples)
 
@@ -168,12 +169,13 @@ def learn(
     sampling: Sampling,
 ) -> Learned:
     """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
-    weights = weights_of(shader, far_light, light)
-    gradient = rays.origins.new_zeros(sum(w.numel() for w in weights))
+    weights = [*shader, far_light], [*(light[:6] if len(light.used) else ())]
+    sums = [rays.origins.new_zeros(sum(w.numel() for w in some)) for some in weights]
     found = learn_all(
-        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, gradient
+        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, *sums
     )
-    for weight, part in zip(weights, gradient.split([w.numel() for w in weights]), strict=True):
-        if weight.numel():
-            _gradient(weight).add_(part.view_as(weight))
+    for some, whole in zip(weights, sums, strict=True):
+        for weight, part in zip(some, whole.split([w.numel() for w in some]) if some else (), strict=True):
+            if weight.numel():
+                _gradient(weight).add_(part.view_as(weight))
     return found._replace(loss=found.loss.sum().float())
