@@ -78,14 +78,7 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        recipe: Recipe,
-        steps: int | None,
-        budget: float | None,
-        seed: int,
-        device: str,
-        on_load: OnLoad | None = None,
+        self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str, on_load: OnLoad | None = None
     ) -> None:
         if (steps is None) == (budget is None):
             raise InputError("fit: give either a number of steps or a time budget, not both.")
