@@ -259,20 +259,21 @@ def begins_of(values: Sequence[int], polarized: Sequence[bool], rays: Sequence[i
 
 def draw_all(
     frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, begins: Tensor, sizes: tuple[int, int, int, int],
-    drawn: int, key: Tensor,
+    drawn: int, key: Tensor, into: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> Drawn:  # fmt: skip
     """``draw`` whose shapes are known to the host; one launch.
 
     Args:
         begins: (3, N + 1) int64, see ``begins_of``. sizes: rays, numbers, numbers of polarization, and the most rays of a modality.
-        drawn: modalities of which there are rays. key: (2,) int64, two words of 32 bits.
+        drawn: modalities of which there are rays. key: (2,) int64, two words of 32 bits. into: where origins, directions (R, 3) and jitter
+            (R,) go, None: anew.
     """
     rays, numbers, axes, most = sizes
     device = frames.origin.device
     new = lambda *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype, device=device)
     whole = lambda count: new(count, dtype=torch.int64)
     out = Drawn(
-        new(rays, 3), new(rays, 3), new(rays), new(rays), new(rays), whole(rays), whole(numbers),
+        *((new(rays, 3), new(rays, 3), new(rays)) if into is None else into), new(rays), new(rays), whole(rays), whole(numbers),
         Measured(new(numbers), whole(numbers), whole(numbers), new(axes, 3), new(numbers), new(numbers), new(numbers)),
     )  # fmt: skip
     if rays:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ _TWO_PI = 2.0 * math.pi
 
 class Numbers(NamedTuple):
     """What changes from step to step, on the device: sharpness, step (), float64, see ``Sampling``; factors (2,) of learning rates, of the
-    surface's the second; key (2,) int64 of random numbers."""
+    surface's the second; key (4,) int64 of random numbers, two words for each of two draws."""
 
     sharpness: Tensor
     step: Tensor
@@ -29,22 +30,24 @@ class Numbers(NamedTuple):
 
 
 @jit
-def numbers_kernel(sharpness, step, factors, key, a, b, c, d, first, second):  # type: ignore[no-untyped-def]
+def numbers_kernel(sharpness, step, factors, key, a, b, c, d, first, second, third, fourth):  # type: ignore[no-untyped-def]
     tl.store(sharpness, a)
     tl.store(step, b)
     tl.store(factors, c)
     tl.store(factors + 1, d)
     tl.store(key, first)
     tl.store(key + 1, second)
+    tl.store(key + 2, third)
+    tl.store(key + 3, fourth)
 
 
 def new_numbers(device: torch.device) -> Numbers:
     of_sampling = torch.zeros(2, dtype=torch.float64, device=device)
-    return Numbers(of_sampling[0], of_sampling[1], torch.zeros(2, device=device), torch.zeros(2, dtype=torch.int64, device=device))
+    return Numbers(of_sampling[0], of_sampling[1], torch.zeros(2, device=device), torch.zeros(4, dtype=torch.int64, device=device))
 
 
-def set_numbers(numbers: Numbers, sharpness: float, step: float, factor: float, surface_factor: float, key: tuple[int, int]) -> None:
-    """By the arguments of a kernel, which are on their way before this returns: nothing waits, nothing is overwritten too early."""
+def set_numbers(numbers: Numbers, sharpness: float, step: float, factor: float, surface_factor: float, key: Sequence[int]) -> None:
+    """By arguments of a kernel, which are on their way when this returns: nothing waits, and nothing is overwritten too early."""
     with torch.cuda.device_of(numbers.key):
         numbers_kernel[(1,)](*numbers, sharpness, step, factor, factor * surface_factor, *key)
 
@@ -127,8 +130,8 @@ def aim(
     """What ``learn`` is told of rays; one launch.
 
     Args:
-        origins, directions, jitter: of those drawn, and behind them of rays where nothing is. bounds: where rays begin and end in contracted
-            space: at least this far from the camera, and at this share of the way to the region; the end.
+        origins, directions, jitter: of those drawn, and behind them of rays where nothing is. bounds: where rays begin and end in
+            contracted space: at least this far from the camera, and at this share of the way to the region; the end.
     """
     count, rays = len(origins), len(drawn.alpha)
     new = lambda *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype, device=origins.device)
@@ -137,9 +140,9 @@ def aim(
     m = drawn.measured
     with torch.cuda.device_of(origins):
         aim_kernel[(triton.cdiv(count, BLOCK),)](
-            origins, directions, drawn.alpha, drawn.ray_weight, m.target, m.level, tables.begins, tables.values, tables.degrees, tables.trains,
-            near, far, degrees, trains, *opacities, count, rays, len(tables.values), *known[:3], *bounds, _BLACK,
-            contracted, known.any, known.black, BLOCK,
+            origins, directions, drawn.alpha, drawn.ray_weight, m.target, m.level,
+            tables.begins, tables.values, tables.degrees, tables.trains, near, far, degrees, trains, *opacities,
+            count, rays, len(tables.values), *known[:3], *bounds, _BLACK, contracted, known.any, known.black, BLOCK,
         )  # fmt: skip
     return Rays(origins, directions, near, far, jitter), View(degrees, trains), opacities
 
@@ -171,7 +174,9 @@ def random_points(numbers: Numbers, count: int, asked: int, extent: float, soft:
 
 
 @jit
-def tally_kernel(squared, level, ray_weight, tile, begins, values_of, steps, residual, errors, kept, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def tally_kernel(  # type: ignore[no-untyped-def]
+    squared, level, ray_weight, tile, begins, values_of, steps, residual, errors, kept, BLOCK: tl.constexpr
+):
     """A program per modality: the mean squared error of its rays is added to ``errors``; tiles take in their rays' residuals."""
     n, modalities = tl.program_id(0), tl.num_programs(0)
     if tl.load(steps) != 0:
@@ -196,8 +201,8 @@ def tally_kernel(squared, level, ray_weight, tile, begins, values_of, steps, res
 
 
 def tally(drawn: Drawn, squared: Tensor, tables: Tables, steps: Tensor, residual: Tensor, errors: Tensor, kept: float) -> None:
-    """What a good step (``optimiser.check``) tells: errors (N,) float64, to which mean squared errors are added; residual (T,) of the tiles,
-    of several rays of one tile any counts. One launch."""
+    """What a good step (``optimiser.check``) tells: errors (N,) float64, to which mean squared errors are added; residual (T,) of the
+    tiles, of several rays of one tile any counts. One launch."""
     with torch.cuda.device_of(squared):
         tally_kernel[(len(tables.values),)](
             squared, drawn.measured.level, drawn.ray_weight, drawn.tile, tables.begins, tables.values, steps, residual, errors, kept, 1024

@@ -1,0 +1,77 @@
+"""A step on the device: what it launches, and that the host waits for nothing; counted on CPU tensors, where its kernels do not run."""
+
+import importlib.util
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mmsynth.field import kernels
+from mmsynth.field.kernels import reference
+from mmsynth.field.light import LAMPS
+from mmsynth.fitting.device_step import DeviceStep, bucket
+from mmsynth.fitting.graphs import Repeated
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.schedule import sampling_at
+from mmsynth.fitting.trainer import Trainer
+from mmsynth.packaged import data_folder
+from mmsynth.scene.load import load_scene
+
+needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+MOST_LAUNCHES = 40
+SMALL = Recipe().with_changes({
+    "surface.max_rows_log2": 10, "radiance.max_rows_log2": 10, "sampling.occupancy_resolution": 16, "radiance.light": "on",
+})  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _without_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "_backend", lambda tensor: reference)
+
+
+def _trainer() -> Trainer:
+    """Of the example: five sensors, polarization among them."""
+    return Trainer(load_scene(data_folder("example_scene")), SMALL, steps=100, budget=None, seed=0, device="cpu")
+
+
+def _device_step(trainer: Trainer, lamps: int) -> DeviceStep:
+    assert trainer.field.light is not None
+    trainer.field.light.add(torch.randn(LAMPS, 3)[:lamps])
+    step = DeviceStep(
+        trainer.field, trainer.measurements, trainer.importance, trainer.optimiser, trainer.log_gain, trainer.needs, trainer.recipe, 0
+    )
+    step.renew()
+    return step
+
+
+@needs_triton
+@pytest.mark.parametrize("lamps", [0, 2])
+@pytest.mark.parametrize("decided", [False, True])
+def test_a_step_launches_few_kernels_and_waits_for_none(lamps: int, decided: bool) -> None:
+    from mmsynth.bench.launches import count
+
+    trainer = _trainer()
+    step, sampling = _device_step(trainer, lamps), sampling_at(0.7, trainer.recipe, trainer.needs)
+    stage = step.stage(sampling, 500, decided, gains=decided, early=False, outside=4)
+    assert stage.lamps == tuple(range(lamps)) and len(stage.rays) == 5
+    run = lambda: step.run(stage, sampling, 3, 1.0, 0.5)
+    count(run)  # what is made once
+    counted = count(run)
+    assert not counted.waits, counted.waits
+    assert counted.launches <= MOST_LAUNCHES, counted
+    assert counted.triton["draw"] == 1 and counted.triton["compare"] == 1 and counted.triton["guarded_adam"] == 3
+    assert counted.triton["mirror_backward"] == (lamps > 0)
+
+
+def test_numbers_of_rays_come_in_steps() -> None:
+    counts = {bucket(rays) for rays in np.geomspace(1000, 64000, 500)}
+    assert len(counts) <= 26 and all(abs(bucket(rays) / rays - 1) < 0.1 for rays in (1000, 12345, 65536))
+
+
+def test_work_on_the_cpu_is_repeated_as_it_is() -> None:
+    done: list[Any] = []
+    repeated = Repeated(lambda: done.append(1), torch.device("cpu"))
+    repeated()
+    repeated()
+    assert len(done) == 2 and repeated.graph is None
