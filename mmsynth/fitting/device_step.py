@@ -277,7 +277,7 @@ class DeviceStep:
         copy = torch.empty(self.told.shape, dtype=self.told.dtype, pin_memory=True)
         copy.copy_(self.told, non_blocking=True)
         event = torch.cuda.Event()
-        event.record()
+        event.record(torch.cuda.current_stream(self.told.device))
         self.copies.append((copy, event))
 
     def news(self, wait: bool = False) -> News | None:

@@ -18,7 +18,7 @@ class Repeated:
     """
 
     def __init__(self, work: Callable[[], None], device: torch.device, capture: bool = True) -> None:
-        self.work, self.capture = work, capture and device.type == "cuda"
+        self.work, self.device, self.capture = work, device, capture and device.type == "cuda"
         self.graph: torch.cuda.CUDAGraph | None = None
         self.calls = 0
 
@@ -27,8 +27,9 @@ class Repeated:
         if not self.capture or self.calls == 1:
             self.work()
             return
-        if self.graph is None:
-            self.graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self.graph):  # records, and does nothing yet
-                self.work()
-        self.graph.replay()
+        with torch.cuda.device(self.device):
+            if self.graph is None:
+                self.graph = torch.cuda.CUDAGraph()
+                with torch.cuda.graph(self.graph):  # records, and does nothing yet
+                    self.work()
+            self.graph.replay()

@@ -13,7 +13,7 @@ from mmsynth.field.kernels.cuda import mirroring
 from mmsynth.field.kernels.cuda.light import material, material_backward
 from mmsynth.field.kernels.cuda.shading import compare_all, programs_of
 from mmsynth.field.kernels.cuda.shared import jit, tl, triton
-from mmsynth.field.kernels.cuda.slopes import eikonal_term, normals_backward, places
+from mmsynth.field.kernels.cuda.slopes import eikonal_programs, eikonal_term, normals_backward, places
 from mmsynth.field.kernels.cuda.surface import surface_gradient
 from mmsynth.field.kernels.cuda.tracing import trace
 from mmsynth.field.kernels.parameters import (
@@ -35,6 +35,7 @@ from mmsynth.field.kernels.parameters import (
 )
 
 _BLOCK = 1024
+_ROWS, _COLUMNS = 64, 32  # of partial sums at a time
 
 
 @jit
@@ -55,19 +56,35 @@ def gains_kernel(log_gain, frame, out, count, rows, BLOCK: tl.constexpr):  # typ
 
 
 @jit
-def gains_by_frame_kernel(gain, gradient, frame, sums, count, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def gains_by_frame_kernel(gain, gradient, frame, out, count, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     g = tl.load(gradient + i, mask=i < count, other=0.0) * tl.load(gain + i, mask=i < count, other=0.0)
-    tl.atomic_add(sums + tl.load(frame + i, mask=i < count, other=0), g, mask=i < count, sem="relaxed")
+    tl.atomic_add(out + tl.load(frame + i, mask=i < count, other=0), g, mask=i < count, sem="relaxed")
 
 
 @jit
-def gains_backward_kernel(sums, gradient, rows, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    mean = _mean(sums, rows, BLOCK)
+def mean_free_kernel(values, rows, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Take their mean from all values."""
+    mean = _mean(values, rows, BLOCK)
     for begin in range(0, rows, BLOCK):
         i = begin + tl.arange(0, BLOCK)
-        more = tl.load(sums + i, mask=i < rows, other=0.0) - mean
-        tl.store(gradient + i, tl.load(gradient + i, mask=i < rows, other=0.0) + more, mask=i < rows)
+        tl.store(values + i, tl.load(values + i, mask=i < rows, other=0.0) - mean, mask=i < rows)
+
+
+@jit
+def add_rows_kernel(parts, stride, rows, first, second, size, count, ROWS: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Add the sum of the rows of ``parts``, in order, to ``first`` (size,) and ``second``, of ``count`` numbers together."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = i < count
+    total = tl.zeros([ROWS, BLOCK], tl.float32)
+    for begin in range(0, rows, ROWS):
+        row = begin + tl.arange(0, ROWS)
+        at = parts + row.to(tl.int64)[:, None] * stride + i[None, :]
+        total += tl.load(at, mask=(row < rows)[:, None] & live[None, :], other=0.0)
+    whole = tl.sum(total, 0)
+    near, far = live & (i < size), live & (i >= size)
+    tl.store(first + i, whole + tl.load(first + i, mask=near, other=0.0), mask=near)
+    tl.store(second + i - size, whole + tl.load(second + i - size, mask=far, other=0.0), mask=far)
 
 
 def _gain_of(gains: Gains) -> Tensor:
@@ -80,11 +97,22 @@ def _gain_of(gains: Gains) -> Tensor:
 
 
 def _gain_backward(gains: Gains, gain: Tensor, gradient: Tensor) -> None:
-    """Add to the gradient of log_gain; by atomics, whose order differs from run to run."""
-    sums = torch.zeros_like(gains.log_gain)
-    with torch.cuda.device_of(sums):
-        gains_by_frame_kernel[(triton.cdiv(len(gain), _BLOCK),)](gain, gradient, gains.frame, sums, len(gain), _BLOCK)
-        gains_backward_kernel[(1,)](sums, _gradient(gains.log_gain), len(sums), _BLOCK)
+    """Add to the gradient of log_gain; by atomics, whose order differs from run to run. Exposures are relative to their mean, so what was
+    there and what is added are free of a mean."""
+    out = _gradient(gains.log_gain)
+    with torch.cuda.device_of(out):
+        gains_by_frame_kernel[(triton.cdiv(len(gain), _BLOCK),)](gain, gradient, gains.frame, out, len(gain), _BLOCK)
+        mean_free_kernel[(1,)](out, len(out), _BLOCK)
+
+
+def _add_rows(parts: Tensor, first: Tensor, second: Tensor) -> None:
+    """Add the sum of (P, W + V) over its rows to (W,) and (V,); one launch."""
+    rows, count = parts.shape
+    if rows:
+        with torch.cuda.device_of(parts):
+            add_rows_kernel[(triton.cdiv(count, _COLUMNS),)](
+                parts, count, rows, first, second, len(first), count, _ROWS, _COLUMNS, num_warps=8
+            )
 
 
 def _gradient(tensor: Tensor) -> Tensor:
@@ -125,16 +153,18 @@ def learn_all(
     where = places(hits, rays, eikonal, grid.extent, shines)
     with torch.enable_grad():
         slopes = surface_gradient(where.at, where.epsilons, grid, network)
-    found = eikonal_term(slopes.detach(), where, eikonal, grid.extent)
+    programs = programs_of(len(rays.origins))
+    loss = torch.empty(programs + eikonal_programs(where), dtype=torch.float64, device=features.device)
+    found = eikonal_term(slopes.detach(), where, eikonal, grid.extent, loss[programs:])
     gain = _gain_of(gains) if len(gains.log_gain) else None
     mirrored = None
     if shines:
         raw = material(light, features)
         lamps, mirrors = Lamps(light.position, light.log_spectrum), Mirrors(raw, found.normals, where.points, rays.directions, where.share)
         mirrored = mirroring.launch(lamps, light.used, True, mirrors, hits.behind, measured)
-    partial = features.new_empty(programs_of(len(rays.origins)), len(of_shader) + len(of_light))
+    partial = features.new_empty(programs, len(of_shader) + len(of_light))
     seen = ShadedRays(features, share, hits.behind, rays.directions, view.degrees, view.trains_geometry)
-    compared = compare_all(shader, seen, measured, gain, mirrored, True, far_light, opacities, partial)
+    compared = compare_all(shader, seen, measured, gain, mirrored, True, far_light, opacities, partial, loss[:programs])
     if shines:
         own, of_material, of_normals = partial[:, len(of_shader) :], torch.empty_like(raw), torch.empty_like(found.normals)
         of_lamps = own[:, sum(w.numel() for w in light[:4]) :]
@@ -144,12 +174,9 @@ def learn_all(
         normals_backward(slopes.detach(), where, of_normals, found.gradient, grid.extent)
     if gain is not None:
         _gain_backward(gains, gain, compared.gain)
-    whole = partial.sum(0)
-    of_shader += whole[: len(of_shader)]
-    if shines:
-        of_light += whole[len(of_shader) :]
+    _add_rows(partial, of_shader, of_light)
     torch.autograd.backward([hits.features, hits.share, slopes], [compared.features, compared.share, found.gradient])
-    return Learned(torch.cat([compared.loss, found.loss]), compared.squared, hits.samples)
+    return Learned(loss, compared.squared, hits.samples)
 
 
 def learn(

@@ -247,12 +247,14 @@ def compare_all(
     far_light: Tensor | None = None,
     opacities: Opacities | None = None,
     partial: Tensor | None = None,
+    loss: Tensor | None = None,
 ) -> Compared:
     """See ``reference.compare``; ``measured.ray`` never decreases. One launch.
 
     Args:
         far_light: (F,), see ``learning.with_far_light``, empty or None: none. opacities: a term of the loss, empty or None: none.
-        partial: where sums of the weights' gradients go, (``programs_of`` rays, W or more); None: anew.
+        partial: where sums of the weights' gradients go, (``programs_of`` rays, W or more); loss: of the loss, (``programs_of`` rays,)
+            float64; None: anew.
     """
     device, count, none = rays.features.device, len(rays.behind), rays.share
     far_light = none[:0] if far_light is None else far_light
@@ -265,7 +267,7 @@ def compare_all(
         partial = new(programs if learn else 0, sum(sizes))
     numbers = len(measured.target)
     out = Compared(
-        torch.empty(programs, dtype=torch.float64, device=device), new(numbers),
+        torch.empty(programs, dtype=torch.float64, device=device) if loss is None else loss, new(numbers),
         *(new(*x.shape) if learn else none for x in (rays.features, rays.share)),
         *(new(numbers) if learn and x is not None else none for x in (gain, mirrored)), partial,
     )  # fmt: skip

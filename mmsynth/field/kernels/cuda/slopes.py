@@ -123,9 +123,8 @@ class Places(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Of ∇sdf at ``Places``: loss (programs,) float64 of the eikonal term, to be summed; its gradient (N, 3); normals (H, 3) of mirrors."""
+    """Of ∇sdf at ``Places``: gradient (N, 3) of the eikonal term; normals (H, 3) of mirrors."""
 
-    loss: Tensor
     gradient: Tensor
     normals: Tensor
 
@@ -144,15 +143,19 @@ def places(hits: Hits, rays: Rays, eikonal: Eikonal, extent: float, mirrors: boo
     return out
 
 
-def eikonal_term(slopes: Tensor, where: Places, eikonal: Eikonal, extent: float) -> Slopes:
-    """The eikonal term of the loss and its gradient, and normals; one launch."""
+def eikonal_programs(where: Places) -> int:
+    """How many sums ``eikonal_term`` makes."""
+    return triton.cdiv(len(where.at), BLOCK)
+
+
+def eikonal_term(slopes: Tensor, where: Places, eikonal: Eikonal, extent: float, loss: Tensor) -> Slopes:
+    """The eikonal term's gradient, and normals; loss (``eikonal_programs``,) float64 is set to parts of the term. One launch."""
     count, mirrors = len(eikonal.points), len(where.points) > 0
     rows = len(slopes) - count
-    programs = triton.cdiv(len(slopes), BLOCK)
-    out = Slopes(torch.empty(programs, dtype=torch.float64, device=slopes.device), torch.empty_like(slopes), torch.empty_like(where.points))
+    out = Slopes(torch.empty_like(slopes), torch.empty_like(where.points))
     with torch.cuda.device_of(slopes):
-        eikonal_kernel[(programs,)](
-            slopes, where.at, where.epsilons, where.points, *out, eikonal.weight / max(asked_points(where, eikonal), 1),
+        eikonal_kernel[(eikonal_programs(where),)](
+            slopes, where.at, where.epsilons, where.points, loss, *out, eikonal.weight / max(asked_points(where, eikonal), 1),
             eikonal.shallow, count, rows, mirrors, extent > 1.0, BLOCK,
         )  # fmt: skip
     return out

@@ -119,12 +119,13 @@ class _Trace(torch.autograd.Function):
                     t.found, t.counts, t.sharpness, t.section_k, t.section_count, t.second, ends, t.touched, g_section, g_share, g_opacity,
                     ray, time, gradient, count, LANES, num_warps=_WARPS_PER_PROGRAM,
                 )  # fmt: skip
-        weights: tuple[Tensor, Tensor] = (torch.zeros_like(hidden), torch.zeros_like(output))
         if count:
             weights = surface_backward(
                 RAYS, grid, network._replace(hidden=hidden, output=output), gradient, 0, triton.cdiv(room, BLOCK),
                 samples=(ray, time, origins, directions, ends[-1:]), positions_out=of_samples,
             )  # fmt: skip
+        else:
+            weights = torch.zeros_like(hidden), torch.zeros_like(output)
         found = None, None
         if to_rays:
             found = torch.empty_like(origins), torch.empty_like(directions)
