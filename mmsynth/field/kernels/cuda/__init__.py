@@ -1,9 +1,9 @@
 """The operations for NVIDIA GPUs, compiled by Triton; what is not is the reference's.
 
-No operation waits for the device or asks it for a shape. All but the gradients of hash tables (see ``encoding``) is bit-deterministic on one
-kind of GPU: no other sum uses atomics. The module imports anywhere; ``available`` says whether its operations can run. With
-TRITON_INTERPRET=1 in the environment before triton is first imported they run, slowly, on CPU tensors: that is how they are tested without a
-GPU.
+No operation waits for the device or asks it for a shape. All but the gradients of hash tables (see ``encoding``) is bit-deterministic on
+one kind of GPU: no other sum uses atomics. The module imports anywhere; ``available`` says whether its operations can run. With
+TRITON_INTERPRET=1 in the environment before triton is first imported they run, slowly, on CPU tensors: that is how they are tested without
+a GPU.
 """
 
 from __future__ import annotations
@@ -16,5 +16,6 @@ from mmsynth.field.kernels.mirroring import mirror
 from mmsynth.field.kernels.reference import adam, compare, march, section_weights, shade
 
 __all__ = [
-    "adam", "available", "compare", "hash_encode", "march", "mirror", "section_weights", "shade", "surface_gradient", "surface_value", "trace",
+    "adam", "available", "compare", "hash_encode", "march", "mirror", "section_weights", "shade", "surface_gradient", "surface_value",
+    "trace",
 ]  # fmt: skip
