@@ -32,6 +32,7 @@ from mmsynth.fitting.recipe import Recipe
 SAMPLES = 1 << 18  # of a step, at the least: with fewer a GPU idles between kernels
 MOST_RAYS = 1 << 18
 _NEWS_EVERY = 16  # steps
+_AHEAD = 2  # times that, by which the host is ahead of the device at the most: a fit of so many seconds does not end later
 _PER_OCTAVE = 4  # numbers of rays for which there are graphs: within 10 % of what is asked for
 _TABLES = {"surface.grid.table": 1, "appearance.table": 0}  # and which of ``Numbers.factors`` is theirs
 
@@ -127,6 +128,9 @@ class DeviceStep:
         self.flat, self.begins = self._flatten()
         self.rates = {n: torch.full((1,), adam.rates[n], device=device) for n in _TABLES}
         self.works: dict[Stage, Repeated] = {}
+        self.tables: list[int] = []
+        self.lamps: tuple[int, ...] = ()
+        self.renew()
 
     def _selection(self) -> kernels.Selection:
         """Where rays are drawn, in arrays that stay."""
@@ -170,18 +174,16 @@ class DeviceStep:
             self.lamps if light is not None else (), decided and self.field.far_light is not None, gains, early, counts, empty,
         )  # fmt: skip
 
-    lamps: tuple[int, ...] = ()
-
     def renew(self) -> None:
         """Take up what was changed between steps: where rays go, lamps, tables of other sizes."""
         self.selection.ends.copy_(self.where.selection.ends)
         self.selection.weight.copy_(self.where.selection.weight)
         light = self.field.light
         self.lamps = () if light is None else tuple(torch.nonzero(light.used)[:, 0].tolist())
-        tables = tuple(self.adam.parameters[n].data_ptr() for n in _TABLES)
-        if tables != getattr(self, "_tables", tables):
+        tables = [self.adam.parameters[n].data_ptr() for n in _TABLES]
+        if tables != self.tables:
             self.works.clear()  # their arrays are gone
-        self._tables = tables
+        self.tables = tables
 
     def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, surface_factor: float) -> None:
         """A step.
@@ -270,7 +272,9 @@ class DeviceStep:
         return work
 
     def _tell(self) -> None:
-        """Send what the device tells on its way."""
+        """Send what the device tells on its way; the host is never more than ``_AHEAD`` times that far ahead of it."""
+        while len(self.copies) > _AHEAD and self.copies[0][1] is not None:
+            self.copies.pop(0)[1].synchronize()
         if self.told.device.type == "cpu":
             self.copies.append((self.told.clone(), None))
             return

@@ -38,11 +38,9 @@ def _trainer() -> Trainer:
 def _device_step(trainer: Trainer, lamps: int) -> DeviceStep:
     assert trainer.field.light is not None
     trainer.field.light.add(torch.randn(LAMPS, 3)[:lamps])
-    step = DeviceStep(
+    return DeviceStep(
         trainer.field, trainer.measurements, trainer.importance, trainer.optimiser, trainer.log_gain, trainer.needs, trainer.recipe, 0
     )
-    step.renew()
-    return step
 
 
 @needs_triton

@@ -74,7 +74,9 @@ def test_trace_equals_reference_with_all_gradients(device: str, states: str, ste
     exact_surface, exact_appearance = copy.deepcopy(surface).double(), copy.deepcopy(appearance).double()
     grid, rays = _states(states, extent).to(device), _rays(RAYS, extent, device)
     sampling = Sampling(sharpness, step, 3, 5, max_optical_depth=4.0)
-    leaves, exact_leaves = ([x.detach().to(dtype, copy=True).requires_grad_() for x in rays[:2]] for dtype in (torch.float32, torch.float64))
+    leaves, exact_leaves = (
+        [x.detach().to(dtype, copy=True).requires_grad_() for x in rays[:2]] for dtype in (torch.float32, torch.float64)
+    )
     found = cuda.trace(*surface.at(3), appearance.at(5), grid, Rays(*leaves, *rays[2:]), sampling)
     exact_rays = Rays(*exact_leaves, *(x.double() for x in rays[2:]))
     expected = _of_all_rays(reference.trace(*exact_surface.at(3), exact_appearance.at(5), grid, exact_rays, sampling))

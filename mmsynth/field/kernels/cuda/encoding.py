@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mmsynth.field.kernels.cuda.shared import COLUMNS, HASH_Y, HASH_Z, jit, position, tl, triton
 
-BLOCK = 128  # positions per program: one per thread at Triton's default of four warps
+BLOCK = 64  # positions per program: two threads each, at Triton's default of four warps
 
 
 @jit
@@ -62,7 +62,7 @@ def cells(ux, uy, uz, resolutions, offsets, first, active, LEVELS: tl.constexpr)
     x, fx = _axis(ux, cells_per_axis, step_x)
     y, fy = _axis(uy, cells_per_axis, step_y)
     z, fz = _axis(uz, cells_per_axis, step_z)
-    return x, y, z, fx, fy, fz, cells_per_axis, begin, (rows - 1).to(tl.uint32), dense, used, step_x, step_y, step_z
+    return x, y, z, fx, fy, fz, cells_per_axis, begin.to(tl.int32), (rows - 1).to(tl.uint32), dense, used, step_x, step_y, step_z
 
 
 @jit
@@ -91,7 +91,9 @@ def _weight(x, y, z, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
 def encode(ux, uy, uz, live, table, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
     """Features at unit positions of the levels from ``first`` on, (BLOCK, COLUMNS); zeros where not ``live`` and for an unused level."""
     LEVELS: tl.constexpr = COLUMNS // FEATURES
-    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(ux, uy, uz, resolutions, offsets, first, active, LEVELS)
+    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(
+        ux, uy, uz, resolutions, offsets, first, active, LEVELS
+    )
     feature = tl.arange(0, FEATURES)[None, None, :]
     here = (live[:, None] & used)[:, :, None]
     value = tl.zeros([ux.shape[0], LEVELS, FEATURES], tl.float32)
@@ -106,7 +108,9 @@ def encode(ux, uy, uz, live, table, resolutions, offsets, first, active, FEATURE
 def scatter(ux, uy, uz, g, live, out, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
     """Add gradients (BLOCK, COLUMNS) of ``encode``'s features to the table's."""
     LEVELS: tl.constexpr = COLUMNS // FEATURES
-    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(ux, uy, uz, resolutions, offsets, first, active, LEVELS)
+    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(
+        ux, uy, uz, resolutions, offsets, first, active, LEVELS
+    )
     feature = tl.arange(0, FEATURES)[None, None, :]
     g = tl.reshape(g, [ux.shape[0], LEVELS, FEATURES])
     # NaN != 0, so that one is passed on

@@ -24,7 +24,7 @@ from mmsynth.field.kernels.cuda.shared import (
 )
 from mmsynth.field.kernels.cuda.surface import distance
 
-LANES = 32  # rays under way per program: one warp, which waits for the slowest of them at every sample
+LANES = 64  # rays under way per program, which waits for the slowest of them at every sample
 
 
 @jit
@@ -103,8 +103,8 @@ def march_kernel(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """See ``reference.march``.
 
-    queue: (2,) int32, zeros: the next ray, and samples of all rays. found: (3, MAX_SAMPLES, rays): ray distance of each sample, distance of the surface, optical
-    depth of the section that ends there. counts: (rays,) int32, samples.
+    queue: (2,) int32, zeros: the next ray, and samples of all rays. found: (3, MAX_SAMPLES, rays): ray distance of each sample, distance of
+    the surface, optical depth of the section that ends there. counts: (rays,) int32, samples.
     """
     sharpness, step = tl.load(sharpness_at), tl.load(step_at).to(tl.float32)
     soft = (1.0 / sharpness * SOFT_SURFACE).to(tl.float32)
@@ -132,9 +132,7 @@ def march_kernel(  # type: ignore[no-untyped-def]
         depth = tl.where(fresh, 0.0, depth)
         # lanes without a ray are where their last one ended, and stay
         t = tl.where(ray < rays, t, far)
-        t, x, y, z, reach, speed, state = _advance(
-            ox, oy, oz, dx, dy, dz, t, far, jitter, states, grid, half, extent, step, CONTRACTED
-        )
+        t, x, y, z, reach, speed, state = _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, states, grid, half, extent, step, CONTRACTED)
         met = (ray < rays) & (t < far)
         f = distance(x, y, z, met, table, resolutions, offsets, active, scale, hidden, width, output, inner, outer, UNITS, HIDDEN, FEATURES)
         later = met & (k > 0)

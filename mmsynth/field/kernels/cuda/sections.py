@@ -1,12 +1,11 @@
 """Sections between the samples of rays in Triton: their weights, the surfaces that they make, and the gradients of both.
 
-One ray per lane, from its first sample to its last. A ray keeps a list of the sections that matter, the columns of a (MAX_SAMPLES, R) array.
+One ray per lane, from its first sample to its last. Sections that matter are listed: the columns of (MAX_SAMPLES, R) arrays.
 """
 
 from __future__ import annotations
 
 from mmsynth.field.kernels.cuda.shared import LAYER_GAP, LEAST_WEIGHT, MAX_SAMPLES, contracted, jit, position, tl
-
 
 
 @jit
@@ -104,8 +103,8 @@ def weigh_backward_kernel(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Gradients of the distances at samples, packed ray after ray: those of the samples that have one.
 
-    dL/df of a sample is s σ(-s f) (dL/dτ of the section it starts - dL/dτ of the one it ends), and dL/dτᵢ = gᵢ Tᵢ e^-τᵢ - Σ_{j>i} gⱼ wⱼ, the
-    sum being the ray's total less what has passed: one pass for the total, one for the rest.
+    dL/df of a sample is s σ(-s f) (dL/dτ of the section it starts - dL/dτ of the one it ends), and dL/dτᵢ = gᵢ Tᵢ e^-τᵢ - Σ_{j>i} gⱼ wⱼ,
+    the sum being the ray's total less what has passed: one pass for the total, one for the rest.
 
     ends: (rays,) int64, cumulated sum of ``touched``. g_section: (MAX_SAMPLES, rays) of the weights of sections that matter.
     """

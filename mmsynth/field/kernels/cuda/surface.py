@@ -2,8 +2,8 @@
 
 A block of positions goes through the grid and the hidden layer ``COLUMNS`` features at a time; nothing between is stored, and the backward
 pass computes it again: rows of a table come from the cache, a stored layer from memory. Products run on the tensor cores in three parts of
-10 bits, which is float32 but for its last bit or two: with one part the surface would move. Gradients of the weights are summed
-per program and then over the programs, in order; those of the table are float32 atomics (see ``encoding``), added to ``table.grad`` in place.
+10 bits, which is float32 but for its last bit or two: with one part the surface would move. Gradients of the weights are summed per
+program and then over the programs, in order; those of the table are float32 atomics (see ``encoding``), added to ``table.grad`` in place.
 """
 
 from __future__ import annotations
@@ -14,10 +14,23 @@ import torch
 from torch import Tensor
 
 from mmsynth.field.kernels.cuda.encoding import encode, scatter, slope, to_frame, unit_cube
-from mmsynth.field.kernels.cuda.shared import COLUMNS, FIRST_FEATURE_ROW, back_to_world, constant, contracted, jit, position, programs, tl, triton
+from mmsynth.field.kernels.cuda.shared import (
+    COLUMNS,
+    FIRST_FEATURE_ROW,
+    back_to_world,
+    constant,
+    contracted,
+    jit,
+    position,
+    programs,
+    tl,
+    triton,
+)
 from mmsynth.field.kernels.parameters import GridTable, SurfaceNetwork
 
 BLOCK = 64  # positions per program
+# two threads for each position keep all in registers; loads that a loop fetched ahead would not
+OPTIONS = {"num_warps": 4, "num_stages": 1}
 POINTS, TAPS, RAYS = range(3)  # what a position of the backward kernel is
 TAPS_MODE, RAYS_MODE = constant(TAPS), constant(RAYS)
 _ROOT3 = constant(3**0.5)
@@ -75,14 +88,15 @@ def _signs(i):  # type: ignore[no-untyped-def]
 
 @jit
 def _tap(positions, epsilons, stride, i, count):  # type: ignore[no-untyped-def]
-    """Tap i, four of a position: its place and signs, the difference's size, and whether it is asked for: not where the size is 0."""
+    """Tap i, four of a position: its place and signs, the factor of its value, and whether it is asked for: not where epsilon is 0."""
     live = i < count
     epsilon = tl.load(epsilons + (i // 4) * stride, mask=live, other=0.0)
     live = live & (epsilon != 0.0)
     x, y, z = position(positions, i // 4, live)
     sx, sy, sz = _signs(i)
     shift = epsilon / _ROOT3
-    return x + sx * shift, y + sy * shift, z + sz * shift, sx, sy, sz, tl.where(live, _ROOT3 / (4.0 * tl.where(live, epsilon, 1.0)), 0.0), live
+    factor = tl.where(live, 0.25 / tl.where(live, epsilon, 1.0) * _ROOT3, 0.0)
+    return x + sx * shift, y + sy * shift, z + sz * shift, sx, sy, sz, factor, live
 
 
 @jit
@@ -128,13 +142,12 @@ def surface_backward_kernel(  # type: ignore[no-untyped-def]
     """Gradients of distances: to the table, to the weights, a part per program, to positions where ``positions_out`` is.
 
     What a position is, ``MODE`` says: POINTS: of (N, 3); TAPS: four of each of (N / 4, 3), ``epsilons`` apart, gradient (N / 4, 3) of the
-    differences; RAYS: sample of a ray of that number, at that ray distance, as many as ``total`` says. weights_out: (programs, size), zeros.
+    differences; RAYS: sample of a ray of that number, at that distance, as many as ``total`` says. weights_out: (programs, size), zeros.
     """
     if MODE == RAYS_MODE:
         count = tl.load(total).to(tl.int32)
     unit = tl.arange(0, HIDDEN)
     factor = tl.load(output + unit, mask=unit < UNITS, other=0.0)
-    w0 = _weights(hidden, width, 0, FIRST_FEATURE_ROW, UNITS, HIDDEN)
     part = weights_out + tl.program_id(0) * size
     to_first = tl.zeros([COLUMNS, HIDDEN], tl.float32)
     to_output = tl.zeros([HIDDEN], tl.float32)
@@ -230,10 +243,9 @@ def launch(grid: GridTable, network: SurfaceNetwork) -> Launch:
     )  # fmt: skip
 
 
-def units_and_warps(units: int) -> tuple[int, int]:
-    """Hidden units that a program computes, a power of two, and its warps for ``BLOCK`` positions: 32 sums a thread stay in registers."""
-    width = max(triton.next_power_of_2(units), 16)
-    return width, min(max(BLOCK * width // 1024, 2), 16)
+def padded_units(units: int) -> int:
+    """Hidden units that a program computes: a power of two, and no less than a product on tensor cores has columns."""
+    return max(triton.next_power_of_2(units), 16)
 
 
 def table_gradient(table: Tensor) -> Tensor | None:
@@ -253,19 +265,20 @@ def surface_backward(
     """Gradients of the network's weights, and in place those of the table; see ``surface_backward_kernel``.
 
     Args:
-        count: of positions; any number where the device knows it. blocks: of positions at the most. samples: rays, times, origins, directions, total.
+        count: of positions; any number where the device knows it. blocks: of positions at the most.
+        samples: rays, times, origins, directions, total.
     """
     units, width = network.hidden.shape
     size = units * width + units + 1
     parts = torch.zeros(min(programs(gradient.device), max(blocks, 1)), size, device=gradient.device)
-    hidden, warps = units_and_warps(units)
+    hidden = padded_units(units)
     rays, times, origins, directions, total = samples or (None,) * 5
     of = launch(grid, network)
     with torch.cuda.device_of(parts):
         surface_backward_kernel[(len(parts),)](
             positions, epsilons, 0 if epsilons is None or epsilons.dim() == 0 else 1, rays, times, origins, directions, gradient, total,
             positions_out, table_gradient(grid.table), parts, *of, count, width, grid.active, size,
-            mode, grid.extent > 1.0, units, grid.table.shape[1], BLOCK, hidden, num_warps=warps,
+            mode, grid.extent > 1.0, units, grid.table.shape[1], BLOCK, hidden, **OPTIONS,
         )  # fmt: skip
     whole = parts.sum(0)
     return whole[: units * width].view(units, width), whole[units * width :]
@@ -292,17 +305,16 @@ class _Value(torch.autograd.Function):
         count, (units, width) = len(positions), hidden.shape
         out = torch.empty(count if epsilons is None else (count, 3), device=positions.device)
         if count:
-            padded, warps = units_and_warps(units)
             of = launch(grid, network)
-            sizes = units, grid.table.shape[1], BLOCK, padded
+            sizes = units, grid.table.shape[1], BLOCK, padded_units(units)
             with torch.cuda.device_of(out):
                 if epsilons is None:
                     blocks = triton.cdiv(count, BLOCK)
-                    surface_kernel[(blocks,)](positions, *of, out, count, width, grid.active, *sizes, num_warps=warps)
+                    surface_kernel[(blocks,)](positions, *of, out, count, width, grid.active, *sizes, **OPTIONS)
                 else:
                     blocks = triton.cdiv(4 * count, BLOCK)
                     gradient_kernel[(blocks,)](
-                        positions, epsilons, min(epsilons.dim(), 1), *of, out, 4 * count, width, grid.active, *sizes, num_warps=warps
+                        positions, epsilons, min(epsilons.dim(), 1), *of, out, 4 * count, width, grid.active, *sizes, **OPTIONS
                     )
         ctx.grid, ctx.network = grid, network
         ctx.save_for_backward(positions, epsilons, hidden, output)
