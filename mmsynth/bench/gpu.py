@@ -30,7 +30,7 @@ from mmsynth.field.surface import Surface
 TARGETS = {80: "A100", 90: "H100, H200", 100: "B200"}  # compute capability × 10, and GPUs that have it
 _TYPES = {
     torch.float16: "fp16", torch.bfloat16: "bf16", torch.float32: "fp32", torch.float64: "fp64",
-    torch.uint8: "u8", torch.bool: "i1", torch.int32: "i32", torch.int64: "i64",
+    torch.uint8: "u8", torch.uint16: "u16", torch.bool: "i1", torch.int32: "i32", torch.int64: "i64",
 }  # fmt: skip
 
 

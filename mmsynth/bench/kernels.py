@@ -301,13 +301,13 @@ OPERATIONS: tuple[Operation, ...] = (
     Operation(
         "march",
         lambda samples: _rays(samples) | _field(),
-        {"torch": _march(reference), "torch cuda": _march(reference), "triton": _march(cuda)},
+        {"torch": _march(reference), "torch cuda": _march(reference)},
         difference=_march_difference,
     ),
     Operation(
         "section_weights",
         _section_inputs,
-        {"torch": _sections(reference), "torch cuda": _sections(reference), "triton": _sections(cuda)},
+        {"torch": _sections(reference), "torch cuda": _sections(reference)},
         leaves=lambda x: [x["sdf"]],
     ),
 )
