@@ -15,7 +15,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.design import Corrections, Design
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
-from mmsynth.field.kernels.constants import LEAST_WEIGHT
+from mmsynth.field.kernels.learning import normals, with_far_light
 from mmsynth.field.kernels.mirroring import material
 from mmsynth.field.light import Light, mean_spectrum, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
@@ -125,15 +125,8 @@ class Field(nn.Module):
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
 
     def with_far_light(self, hits: rendering.Hits) -> rendering.Hits:
-        """What is shaded. Light from beyond the region has features, too, and no place: only a direction; it is mixed into the last surface
-        of each ray. Where it is modelled, no ray ends in the dark."""
-        if self.far_light is None:
-            return hits
-        last = torch.where(hits.behind >= 0, hits.behind, torch.arange(len(hits.behind), device=hits.behind.device))
-        passed = torch.zeros_like(hits.share).index_add(0, last, 1.0 - hits.opacity)
-        share = hits.share + passed
-        mixed = (passed / share.clamp(min=LEAST_WEIGHT))[:, None]
-        return hits._replace(features=torch.lerp(hits.features, self.far_light.expand_as(hits.features), mixed), share=share)
+        """What is shaded, see ``learning.with_far_light``."""
+        return hits if self.far_light is None else with_far_light(hits, self.far_light)
 
     def slopes(self, points: Tensor, active: int, cells: float = 1.0) -> Tensor:
         """∇sdf (N, 3) in the frame of the grid, at points (N, 3) of the normalised frame, by differences over so many cells."""
@@ -141,9 +134,7 @@ class Field(nn.Module):
 
     def normals(self, points: Tensor, slopes: Tensor) -> Tensor:
         """Unit, outward (N, 3), in the normalised frame, from ``slopes`` at these points."""
-        if self.surface.grid.extent > 1.0:
-            slopes = kernels.contracted_velocity(points, slopes)  # the chain rule: the contraction's Jacobian is symmetric
-        return torch.nn.functional.normalize(slopes, dim=-1)
+        return normals(points, slopes, self.surface.grid.extent)
 
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
@@ -312,8 +303,9 @@ class Field(nn.Module):
         ray = kernels.rays_of(hits.behind, len(hits.share))
         points = origins[ray] + directions[ray] * hits.distance[:, None]
         slopes = self.slopes(points.detach(), active, MIRROR_CELLS)
-        normals = self.normals(points.detach(), slopes)
-        return kernels.Mirrors(self.light.material(hits.features), normals, points, directions[ray], hits.share), slopes
+        share = torch.where(hits.distance > 0, hits.share, torch.zeros_like(hits.share))  # without a place there is no normal
+        outward = self.normals(points.detach(), slopes)
+        return kernels.Mirrors(self.light.material(hits.features), outward, points, directions[ray], share), slopes
 
     def mirrored(self, hits: rendering.Hits, origins: Tensor, directions: Tensor, measured: kernels.Measured, active: int) -> Tensor:
         """Mirrored light in each number that was measured along rays, (M,), 0 where nothing shines."""

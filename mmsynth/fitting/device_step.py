@@ -99,6 +99,8 @@ class DeviceStep:
         capture: whether stages become graphs.
     """
 
+    samples, most_rays, first_rays = SAMPLES, MOST_RAYS, SAMPLES // 64  # a ray of the first step takes that many samples or more
+
     def __init__(
         self,
         field: Field,

@@ -48,7 +48,6 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
     near, far_end = interval(surface, origins, directions)
     polarized = RAYS // 3
     ray = torch.cat([torch.arange(RAYS - polarized).repeat_interleave(3), torch.arange(RAYS - polarized, RAYS)])
-    bright = 3 * (RAYS - polarized)
     output = torch.cat([torch.arange(3).repeat(RAYS - polarized), torch.full((polarized,), 3)])
     axes = nn.functional.normalize(torch.randn(polarized, 3), dim=1)
     numbers = len(ray)
@@ -134,7 +133,13 @@ def test_sums_do_not_depend_on_threads() -> None:
 
 def test_far_light_is_what_a_ray_without_surface_shows() -> None:
     hits = kernels.Hits(
-        torch.zeros(1, 4), torch.zeros(1), torch.zeros(1), torch.full((1,), -1), torch.zeros(1), torch.full((1,), torch.nan), torch.tensor(0)
+        torch.zeros(1, 4),
+        torch.zeros(1),
+        torch.zeros(1),
+        torch.full((1,), -1),
+        torch.zeros(1),
+        torch.full((1,), torch.nan),
+        torch.tensor(0),
     )
     shaded = learning.with_far_light(hits, torch.ones(4))
     assert torch.equal(shaded.features, torch.ones(1, 4)) and shaded.share.item() == 1.0

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mmsynth.field.kernels import Measured, photometric, predict, residual
-from mmsynth.fitting.losses import eikonal
 from mmsynth.fitting.measurements import Batch, Measurements, draw, measure
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Sensor
@@ -225,11 +224,3 @@ def test_dark_modalities_weigh_as_much_as_bright_ones(level: float) -> None:
     relative = torch.linspace(-2, 2, 9)
     loss = photometric(relative * level, _alone([0.0] * 9, 1.0, level).measured)
     assert float(loss) == pytest.approx(float(photometric(relative, _alone([0.0] * 9, 1.0, 1.0).measured)), rel=1e-5)
-
-
-def test_eikonal_is_zero_for_distances_alone() -> None:
-    units = torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
-    assert float(eikonal(units)) < 1e-12
-    assert float(eikonal(torch.tensor([[3.0, 0.0, 4.0], [0.0, 1.0, 0.0]]))) == pytest.approx(8.0)
-    slopes = torch.tensor([[0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 1.5, 0.0]])
-    assert float(eikonal(slopes, torch.tensor([0.1, 1.0, 0.1]))) == pytest.approx((0.1 + 1.0 + 1.0) / 3 * 0.25)

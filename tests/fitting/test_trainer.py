@@ -334,38 +334,42 @@ def test_a_loss_that_is_not_finite_skips_the_step(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("what", ["surface.output_weight", "shader.heads.weight", "surface.grid.table"])
-def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str) -> None:
-    trainer = _trainer(scene)
+def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer, learn = _trainer(scene), kernels.learn
     trainer.run_step()
-    parameter = dict(trainer.field.named_parameters())[what]
-    if what == "surface.grid.table":  # its gradient is added in place: what is NaN there came by the network
-        trainer.field.surface.hidden.register_hook(lambda g: g * torch.nan)
-        hook = trainer.field.surface.output_weight.register_hook(lambda g: g * torch.nan)
-    else:
-        hook = parameter.register_hook(lambda g: g * torch.nan)
+    parameters = dict(trainer.field.named_parameters())
+    # what is NaN in a table's gradient came by the network
+    wrong = [parameters[n] for n in ([what, "surface.hidden"] if what == "surface.grid.table" else [what])]
+
+    def broken(*args: Any) -> kernels.Learned:
+        learned = learn(*args)
+        for parameter in wrong:
+            parameter.grad[0] = torch.nan
+        return learned
+
     before, moments = _tensors(trainer.field), {n: [x.clone() for x in m] for n, m in trainer.optimiser.moments.items()}
-    trainer.run_step()
+    with monkeypatch.context() as patch:
+        patch.setattr(kernels, "learn", broken)
+        trainer.run_step()
     assert (trainer.state.bad_steps, trainer.optimiser.count) == (1, 1)
     assert all(torch.equal(value, before[name]) for name, value in _tensors(trainer.field).items())
     assert all(torch.equal(x, y) for n, m in trainer.optimiser.moments.items() for x, y in zip(m, moments[n], strict=True))
     assert not any(p.grad.any() for p in trainer.field.parameters() if p.grad is not None)  # nothing is left for the next step
-    if what != "surface.grid.table":
-        hook.remove()
-        trainer.run_step()
-        assert (trainer.state.bad_steps, trainer.optimiser.count) == (1, 2)
-        assert all(torch.isfinite(p).all() for p in trainer.field.parameters())
+    trainer.run_step()
+    assert (trainer.state.bad_steps, trainer.optimiser.count) == (1, 2)
+    assert all(torch.isfinite(p).all() for p in trainer.field.parameters())
 
 
 def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    compare = kernels.compare
+    learn = kernels.learn
 
-    def sometimes(*args: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    def sometimes(*args: Any) -> kernels.Learned:
         calls.append(1)
-        loss, squared = compare(*args)
-        return loss * (torch.nan if len(calls) in (1, 4) else 1.0), squared
+        learned = learn(*args)
+        return learned._replace(loss=learned.loss * (torch.nan if len(calls) in (1, 4) else 1.0))
 
-    monkeypatch.setattr(kernels, "compare", sometimes)
+    monkeypatch.setattr(kernels, "learn", sometimes)
     news: list[FitProgress] = []
     field = fit(scene, tmp_path, recipe=SMALL, steps=6, on_step=news.append)
     assert field.manifest["skipped_steps"] == 2 and field.manifest["steps"] == 6
@@ -388,7 +392,7 @@ def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -
 def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     trainer.recipe = _recipe(**changes)
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
-    return float(trainer._loss(batch, sampling, torch.Generator().manual_seed(0))[0].detach())
+    return float(trainer._learn(batch, sampling, np.random.default_rng(0), torch.Generator().manual_seed(0)).loss)
 
 
 @torch.no_grad()

@@ -12,14 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, MAX_SAMPLES_PER_RAY
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT
 from mmsynth.field.kernels.cpu import mirroring, shading
-from mmsynth.field.kernels.cpu.blocks import scatter_block, surface_block, surface_block_backward
+from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, padded_output, scatter_block, surface_block, surface_block_backward
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, contract, find_sections, march_rays, velocity
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, padded_to, whole
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
-from mmsynth.field.kernels.cpu.shading import Layers, add_product, clear, clear_gradients, compare_rays, first_at, layer, layer_backward, padded
+from mmsynth.field.kernels.cpu.shading import Layers, clear_gradients, compare_rays, first_at, layer, layer_backward
 from mmsynth.field.kernels.cpu.tasks import take
-from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward
+from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
 from mmsynth.field.kernels.learning import TAPS
 from mmsynth.field.kernels.parameters import Mirrors, Rays, ShadedRays
 
@@ -33,21 +34,31 @@ _LEAST_WEIGHT, _TINY = _f(LEAST_WEIGHT), _f(1e-12)
 
 
 class TapStore(NamedTuple):
-    """Of points at which the surface's gradient is asked for, a slot per chunk: blocks of ``TAPPED`` points: block, hidden (see ``blocks``);
-    counts: points of each block; used: blocks. row: scratch; the weights' gradients."""
+    """Of points at which the surface's gradient is asked for, a slot per chunk: block (see ``blocks``), four rows a point; used: rows; the
+    weights' gradients."""
 
     block: np.ndarray
-    hidden: np.ndarray
-    counts: np.ndarray
     used: np.ndarray
-    row: np.ndarray
-    hidden_out: np.ndarray
+    turned_out: np.ndarray
+    output_out: np.ndarray
+
+
+class TableStore(NamedTuple):
+    """What tables learn from, a slot per chunk of rays: of the samples that have a gradient, their rows (see ``blocks``), and of the sections;
+    how many; the gradients of the surface's weights."""
+
+    block: np.ndarray
+    samples: np.ndarray
+    s_block: np.ndarray
+    sections: np.ndarray
+    turned_out: np.ndarray
     output_out: np.ndarray
 
 
 class ChunkScratch(NamedTuple):
     """Of the rays of a chunk, a slot per thread. Rows: ``CHUNK`` surfaces nearest to the cameras, and ``CHUNK`` behind them."""
 
+    hidden: np.ndarray  # of the taps: a row for each of ``TapStore``
     features: np.ndarray  # (2, CHUNK, F)
     weight: np.ndarray  # (2, CHUNK)
     distance: np.ndarray
@@ -71,7 +82,6 @@ class ChunkScratch(NamedTuple):
     found: np.ndarray
     row_of: np.ndarray  # (MOST_TAPPED,)
     shallow: np.ndarray
-    values: np.ndarray  # (4 TAPPED,)
     x: np.ndarray  # of the light's network: matrices of whole tiles
     h: np.ndarray
     y: np.ndarray
@@ -104,55 +114,46 @@ class LightLayers(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slopes(at, n, epsilon, grid, network, values, taps, slot, found):  # type: ignore[no-untyped-def]
-    """See ``learning.surface_gradient``: of n points ``at`` (n, 3), kept in the slot of ``taps`` behind what is there."""
-    size = FIRST_FEATURE_ROW + FEATURES * grid.resolutions.shape[0]
-    units = network.hidden.shape[0]
+def _slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: ignore[no-untyped-def]
+    """See ``learning.surface_gradient``: of n points ``at`` (n, 3), whose taps are kept in the slot of ``taps`` behind what is there."""
     move, scale = epsilon / _f(math.sqrt(3.0)), _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
+    values = np.empty(4 * TAPPED, np.float32)
     for begin in range(0, n, TAPPED):
-        count = np.int64(min(TAPPED, n - begin))
-        positions = 4 * count
-        b = taps.used[slot, 0]
-        f = taps.block[slot, b * 4 * TAPPED * size :]
-        for t in range(4):
-            for i in range(count):
+        count, used = np.int64(min(TAPPED, n - begin)), np.int64(taps.used[slot, 0])
+        block = taps.block[slot, used:]
+        for i in range(count):
+            for t in range(4):
+                row = 4 * i + t
                 for a in range(3):
-                    f[a * positions + t * count + i] = at[begin + i, a] + move * _TAPS[t, a]
-        for i in range(3 * positions, 4 * positions):
-            f[i] = _ONE
-        surface_block(f, taps.hidden[slot, b * 4 * TAPPED * units :], values, positions, grid, network)
+                    block[row, a] = at[begin + i, a] + move * _TAPS[t, a]
+                block[row, 3] = _ONE
+        surface_block(block, hidden[used:], values, 4 * count, grid, surface)
         for i in range(count):
             for a in range(3):
                 total = _ZERO
                 for t in range(4):
-                    total += values[t * count + i] * _TAPS[t, a]
+                    total += values[4 * i + t] * _TAPS[t, a]
                 found[begin + i, a] = total * scale
-        taps.counts[slot, b] = count
-        taps.used[slot, 0] = b + 1
+        taps.used[slot, 0] = used + 4 * count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slopes_backward(g, n, epsilon, grid, network, values, taps, slot, first):  # type: ignore[no-untyped-def]
-    """From gradients g (n, 3) of the slopes; ``first``: their first block."""
-    size = FIRST_FEATURE_ROW + FEATURES * grid.resolutions.shape[0]
-    units = network.hidden.shape[0]
+def _slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  # type: ignore[no-untyped-def]
+    """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
     scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
-    begin = 0
-    b = np.int64(first)
-    while begin < n:
-        count = np.int64(taps.counts[slot, b])
-        for t in range(4):
-            for i in range(count):
+    values = np.empty(4 * TAPPED, np.float32)
+    for begin in range(0, n, TAPPED):
+        count, used = np.int64(min(TAPPED, n - begin)), first + 4 * begin
+        for i in range(count):
+            for t in range(4):
                 total = _ZERO
                 for a in range(3):
                     total += g[begin + i, a] * _TAPS[t, a]
-                values[t * count + i] = total * scale
+                values[4 * i + t] = total * scale
         surface_block_backward(
-            taps.block[slot, b * 4 * TAPPED * size :], taps.hidden[slot, b * 4 * TAPPED * units :], values, 4 * count, grid.active, network,
-            taps.row[slot], taps.hidden_out[slot], taps.output_out[slot],
+            taps.block[slot, used:], hidden[used:], values, 4 * count, grid.active, surface, taps.turned_out[slot],
+            taps.output_out[slot],
         )  # fmt: skip
-        begin += count
-        b += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -173,17 +174,16 @@ def _is_within(p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _learn_points(chunk, count, points, begin, eikonal, factor, grid, network, scratch, slot, taps):  # type: ignore[no-untyped-def]
+def _learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, scratch, slot, taps):  # type: ignore[no-untyped-def]
     """The pull at some of the points of all space: its part of the loss."""
-    values = scratch.values[slot]
     at, found = points[begin : begin + count], scratch.found[slot]
     taps.used[chunk, 0] = 0
-    taps.hidden_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
-    _slopes(at, count, eikonal.epsilon, grid, network, values, taps, chunk, found)
+    taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
+    _slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
     loss, g = 0.0, np.zeros((count, 3), np.float32)
     for i in range(count):
         loss += _pull(found[i], factor, eikonal.shallow if _is_within(at[i]) else _ONE, g[i])
-    _slopes_backward(g, count, eikonal.epsilon, grid, network, values, taps, chunk, 0)
+    _slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
     return loss
 
 
@@ -229,7 +229,7 @@ def _mix_backward(count, far_light, features, share, opacity, behind, mixed_shar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _see_mirrors(begin, count, ray0, rays, trace, taps, lamps, light, measured, scratch, slot, chunk, grid, network, epsilon, mirrored):  # type: ignore[no-untyped-def]
+def _see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, epsilon, mirrored):  # type: ignore[no-untyped-def]
     """Surfaces of some rays as mirrors: points, slopes, normals, material, and the light that they mirror. Blocks are added to ``taps``."""
     s, behind = scratch, scratch.behind[slot]
     material, normals, points, directions = s.material[slot], s.normals[slot], s.points[slot], s.directions[slot]
@@ -256,8 +256,8 @@ def _see_mirrors(begin, count, ray0, rays, trace, taps, lamps, light, measured, 
                 at[n, 0], at[n, 1], at[n, 2] = px, py, pz
                 row_of[n] = row
                 n += 1
-    _slopes(at, n, epsilon, grid, network, s.values[slot], taps, chunk, found)
-    clear(x, shading.whole(n, shading.TILE_ROWS), x.shape[1])
+    _slopes(at, n, epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
+    clear(x, whole(n, TILE_ROWS), x.shape[1])
     for i in range(n):
         row = row_of[i]
         sx, sy, sz = found[i, 0], found[i, 1], found[i, 2]
@@ -269,8 +269,8 @@ def _see_mirrors(begin, count, ray0, rays, trace, taps, lamps, light, measured, 
         normals[row, 0], normals[row, 1], normals[row, 2] = sx / norm, sy / norm, sz / norm
         for j in range(width):
             x[i, j] = features[row, j]
-    layer(n, x, shading.whole(width, shading.TILE_COLS), light.first_turned, light.first_bias, h)
-    rows = shading.whole(n, shading.TILE_ROWS)
+    layer(n, x, whole(width, TILE_COLS), light.first_turned, light.first_bias, h)
+    rows = whole(n, TILE_ROWS)
     clear(y, rows, y.shape[1])
     add_product(h, light.second_turned, y, rows, h.shape[1], y.shape[1])
     for i in range(n):
@@ -283,7 +283,7 @@ def _see_mirrors(begin, count, ray0, rays, trace, taps, lamps, light, measured, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mirrors_backward(  # type: ignore[no-untyped-def]
-    begin, count, n, first, ray0, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, network, eikonal, factor, g_mirrored, out
+    begin, count, n, first, ray0, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor, g_mirrored, out
 ):  # fmt: skip
     """Gradients of ``_see_mirrors``, of whose n points ``first`` is the first block, and the pull at them: its part of the loss."""
     s, behind = scratch, scratch.behind[slot]
@@ -293,7 +293,7 @@ def _mirrors_backward(  # type: ignore[no-untyped-def]
     gradients = mirroring.Gradients(g_material, g_normals, g_share, out.position, out.spectrum)
     mirror_rays_backward(begin, begin + count, ray0, chunk, lamps, mirrors, behind, measured, g_mirrored, gradients)
     x, h, gy, gh, at = s.x[slot], s.h[slot], s.gy[slot], s.gh[slot], s.at[slot]
-    rows, wide, loss = shading.whole(n, shading.TILE_ROWS), grid.extent > _ONE, 0.0
+    rows, wide, loss = whole(n, TILE_ROWS), grid.extent > _ONE, 0.0
     clear(gy, rows, gy.shape[1])
     for i in range(n):
         row = row_of[i]
@@ -319,7 +319,7 @@ def _mirrors_backward(  # type: ignore[no-untyped-def]
                 gx, gy_, gz = velocity(px, py, pz, r, gx, gy_, gz)
             at[i, 0], at[i, 1], at[i, 2] = gx, gy_, gz
         loss += _pull(found[i], factor, _ONE, at[i])
-    _slopes_backward(at, n, eikonal.mirror_epsilon, grid, network, s.values[slot], taps, chunk, first)
+    _slopes_backward(at, n, eikonal.mirror_epsilon, grid, surface, taps, chunk, scratch.hidden[slot], first)
     add_product(gy.T, h, out.second[chunk], gy.shape[1], n, h.shape[1])
     clear(gh, rows, gh.shape[1])
     add_product(gy, light.second, gh, rows, gy.shape[1], gh.shape[1])
@@ -338,8 +338,8 @@ def _mirrors_backward(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _learn_rays(  # type: ignore[no-untyped-def]
-    chunk, slot, begin, count, total, rays, states, sampling, grid, network, appearance, layers, heads, heads_bias, light, lamps, far_light,
-    view, measured, gain, opacities, eikonal, asked, store, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    chunk, slot, begin, count, total, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light,
+    view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """All of a chunk of rays, of which ``begin`` is the first: its loss."""
     s, sharpness = scratch, sampling.sharpness
@@ -348,9 +348,9 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     features, weight, distance, shown, depth = s.features[slot], s.weight[slot], s.distance[slot], s.shown[slot], s.depth[slot]
     behind, g_features, g_share = s.behind[slot], s.g_features[slot], s.g_share[slot]
     wide = grid.extent > _ONE
-    samples[chunk] = march_rays(0, count, chunk, here, states, sampling, grid, network, store)
-    sections = find_sections(0, count, chunk, here, wide, sampling, store, weight, depth)
-    composite(0, count, chunk, sections, appearance, store, features, distance, shown)
+    samples[chunk] = march_rays(0, count, slot, here, states, sampling, grid, surface, store)
+    sections = find_sections(0, count, slot, here, wide, sampling, store, weight, depth)
+    composite(0, count, slot, sections, appearance, store, features, distance, shown)
     share, rows = weight.reshape(2 * CHUNK), features.reshape(2 * CHUNK, -1)
     opacity = np.empty(CHUNK, np.float32)
     loss = 0.0
@@ -358,7 +358,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
         behind[i] = CHUNK + i if weight[1, i] != _ZERO else -1
         opacity[i] = weight[0, i] + weight[1, i]
     taps.used[chunk, 0] = 0
-    taps.hidden_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
+    taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
     shines, trains = len(lamps.position) > 0, view.trains_geometry[begin:end]
     factor = eikonal.weight / _f(max(asked, 1))
     if shines:
@@ -376,7 +376,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
         first, n = np.int64(taps.used[chunk, 0]), np.int64(0)
         if shines:
             n = _see_mirrors(
-                sub, some, begin, here, store, taps, lamps, light, measured, scratch, slot, chunk, grid, network, eikonal.mirror_epsilon,
+                sub, some, begin, here, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal.mirror_epsilon,
                 mirrored,
             )  # fmt: skip
         for i in range(sub, sub + some):
@@ -395,11 +395,11 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             )  # fmt: skip
         if shines:
             loss += _mirrors_backward(
-                sub, some, n, first, begin, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, network, eikonal, factor,
+                sub, some, n, first, begin, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor,
                 g_mirrored, out,
             )  # fmt: skip
     if not shines:
-        loss += _learn_met(begin, count, total, here, depth, eikonal, factor, grid, network, scratch, slot, chunk, taps)
+        loss += _learn_met(begin, count, total, here, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps)
     if len(opacities.target):
         for i in range(count):
             off = opacity[i] - opacities.target[begin + i]
@@ -407,11 +407,37 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             loss += np.float64(w * off * off + along * opacity[i])
             for which in range(2):
                 g_share[which * CHUNK + i] += _f(2.0) * w * off + along
-    rays_backward(
-        0, count, chunk, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, grid.active, network, appearance.active,
-        store,
-    )  # fmt: skip
+    rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
+    kept.turned_out[chunk], kept.output_out[chunk] = _ZERO, _ZERO
+    n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
+    samples_backward(
+        kept.block[chunk], store.hidden[slot], store.sdf[slot], n, grid.active, surface, kept.turned_out[chunk], kept.output_out[chunk]
+    )
     return loss
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-def]
+    """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Hidden units and
+    gradients of these samples move to the front of their arrays."""
+    sdf, block, hidden, out = store.sdf[slot], store.block[slot], store.hidden[slot], kept.block[chunk]
+    n = np.int64(0)
+    for i in range(store.samples[slot, 0]):
+        if sdf[i] == _ZERO:
+            continue
+        for j in range(width):
+            out[n, j] = block[i, j]
+        if n < i:
+            hidden[n] = hidden[i]
+            sdf[n] = sdf[i]
+        n += 1
+    kept.samples[chunk, 0] = n
+    sections = store.s_count[slot, 0]
+    kept.sections[chunk, 0] = sections
+    for i in range(sections):
+        for j in range(s_width):
+            kept.s_block[chunk, i, j] = store.s_block[slot, i, j]
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -424,7 +450,7 @@ def _shifted(behind, sub, some):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _learn_met(begin, count, total, rays, depth, eikonal, factor, grid, network, scratch, slot, chunk, taps):  # type: ignore[no-untyped-def]
+def _learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps):  # type: ignore[no-untyped-def]
     """The pull near the surfaces that some of the rays meet (see ``learning.asked_rays``): its part of the loss."""
     wide, n, asked = grid.extent > _ONE, np.int64(0), np.int64(min(len(eikonal.noise), total))
     at, found, shallow = scratch.at[slot], scratch.found[slot], scratch.shallow[slot]
@@ -443,19 +469,19 @@ def _learn_met(begin, count, total, rays, depth, eikonal, factor, grid, network,
         at[n, 0], at[n, 1], at[n, 2] = px + eikonal.noise[q, 0], py + eikonal.noise[q, 1], pz + eikonal.noise[q, 2]
         shallow[n] = eikonal.shallow if _is_within(at[n]) else _ONE
         n += 1
-    _slopes(at, n, eikonal.epsilon, grid, network, scratch.values[slot], taps, chunk, found)
+    _slopes(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
     loss = 0.0
     for i in range(n):
         at[i, 0], at[i, 1], at[i, 2] = _ZERO, _ZERO, _ZERO
         loss += _pull(found[i], factor, shallow[i], at[i])
-    _slopes_backward(at, n, eikonal.epsilon, grid, network, scratch.values[slot], taps, chunk, 0)
+    _slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
     return loss
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _work(  # type: ignore[no-untyped-def]
-    worker, next_task, rays, states, sampling, grid, network, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured,
-    gain, opacities, eikonal, store, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    worker, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured,
+    gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """Take chunks of rays, and then points, until there are none."""
     total, points = rays.origins.shape[0], eikonal.points.shape[0]
@@ -466,8 +492,8 @@ def _work(  # type: ignore[no-untyped-def]
         if chunk < chunks:
             begin = chunk * CHUNK
             out.loss[chunk] = _learn_rays(
-                chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, network, appearance, layers,
-                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, taps, shaded, scratch, out,
+                chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, surface, appearance, layers,
+                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out,
                 samples, squared, mirrored, g_mirrored, g_gain,
             )  # fmt: skip
             continue
@@ -476,14 +502,14 @@ def _work(  # type: ignore[no-untyped-def]
             return
         factor = eikonal.weight / _f(max(asked, 1))
         out.loss[chunk] = _learn_points(
-            chunk, np.int64(min(POINTS, points - begin)), eikonal.points, begin, eikonal, factor, grid, network, scratch, worker, taps
+            chunk, np.int64(min(POINTS, points - begin)), eikonal.points, begin, eikonal, factor, grid, surface, scratch, worker, taps
         )
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def learn_rays(  # type: ignore[no-untyped-def]
     threads, next_task, rays, states, sampling, grid, network, appearance, shader, light, lamps, far_light, view, measured, gain, opacities, eikonal,
-    store, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """See ``learning.learn``: all but the gradients of the tables, which ``learn_tables`` adds up.
 
@@ -493,6 +519,11 @@ def learn_rays(  # type: ignore[no-untyped-def]
         padded(shader.first), padded(shader.first.T), shader.first_bias,
         padded(shader.second), padded(shader.second.T), shader.second_bias,
     )  # fmt: skip
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    surface = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
     network_of_light = LightLayers(
         padded(light.first), padded(light.first.T), light.first_bias,
         padded(light.second), padded(light.second.T), light.second_bias,
@@ -500,45 +531,33 @@ def learn_rays(  # type: ignore[no-untyped-def]
     next_task[0] = 0
     for worker in prange(threads):
         _work(
-            np.int64(worker), next_task, rays, states, sampling, grid, network, appearance, layers, shader.heads, shader.heads_bias,
-            network_of_light, lamps, far_light, view, measured, gain, opacities, eikonal, store, taps, shaded, scratch, out, samples, squared,
+            np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, shader.heads, shader.heads_bias,
+            network_of_light, lamps, far_light, view, measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared,
             mirrored, g_mirrored, g_gain,
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_level(task, chunks, point_chunks, grid, appearance, store, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
-    """The gradient of a level of the surface's table, or of the appearance's."""
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
-    if task >= grid.active:
-        for chunk in range(chunks):
-            scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active, 3)
-        return
-    for chunk in range(chunks):
-        used = np.int64(0)
-        for b in range(store.rounds[chunk, 0]):
-            n = np.int64(store.sizes[chunk, b])
-            scatter_block(store.block[chunk, used * size :], n, grid, gradient, task, FIRST_FEATURE_ROW)
-            used += n
-    for chunk in range(chunks + point_chunks):
-        for b in range(taps.used[chunk, 0]):
-            n = np.int64(4 * taps.counts[chunk, b])
-            scatter_block(taps.block[chunk, b * 4 * TAPPED * size :], n, grid, gradient, task, FIRST_FEATURE_ROW)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_levels(next_task, chunks, point_chunks, grid, appearance, store, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+def _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+    """Take levels, of the surface's table and then of the appearance's, until there are none."""
     while True:
         task = take(next_task, 0)
-        if task >= grid.active + appearance.active:
+        level = task - grid.active
+        if level >= appearance.active:
             return
-        _add_level(task, chunks, point_chunks, grid, appearance, store, taps, gradient, a_gradient)
+        for chunk in range(chunks):
+            if level < 0:
+                scatter_block(kept.block[chunk], kept.samples[chunk, 0], grid, gradient, task)
+            else:
+                scatter_block(kept.s_block[chunk], kept.sections[chunk, 0], appearance, a_gradient, level)
+        for chunk in range(chunks + point_chunks if level < 0 else 0):
+            scatter_block(taps.block[chunk], taps.used[chunk, 0], grid, gradient, task)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def learn_tables(threads, next_task, rays, points, grid, appearance, store, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+def learn_tables(threads, next_task, rays, points, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Add what ``learn_rays`` found to the gradients of both tables, a task for each level."""
     chunks, point_chunks = (rays + CHUNK - 1) // CHUNK, (points + POINTS - 1) // POINTS
     next_task[0] = 0
     for _ in prange(threads):
-        _add_levels(next_task, chunks, point_chunks, grid, appearance, store, taps, gradient, a_gradient)
+        _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient)

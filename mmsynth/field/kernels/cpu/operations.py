@@ -17,6 +17,7 @@ from torch import Tensor
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.learning import TableStore, TapStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
@@ -26,6 +27,7 @@ from mmsynth.field.kernels.cpu.stores import (
     ray_store,
     shading_store,
     surface_store,
+    table_store,
     tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
@@ -94,9 +96,17 @@ def _kept(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def _summed(arrays: SurfaceStore | RayStore, chunks: int) -> tuple[Tensor, Tensor]:
-    """Gradients of a network's weights."""
-    return torch.from_numpy(arrays.hidden_out[:chunks].sum(0)), torch.from_numpy(arrays.output_out[:chunks].sum(0))
+def _of_weights(arrays: SurfaceStore | RayStore | TableStore | TapStore, chunks: int, like: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients of a network's hidden layer, which is like this one, and of its last."""
+    units, inputs = like.shape
+    output = arrays.output_out[:chunks].sum(0)
+    return arrays.turned_out[:chunks].sum(0)[:inputs, :units].T, np.append(output[:units], output[-1])
+
+
+def _summed(arrays: SurfaceStore | RayStore, chunks: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """The same for autograd."""
+    hidden, output = _of_weights(arrays, chunks, like)
+    return torch.from_numpy(np.ascontiguousarray(hidden)), torch.from_numpy(output)
 
 
 def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
@@ -110,7 +120,7 @@ class _Value(torch.autograd.Function):
     def forward(
         ctx: Any, keep: bool, positions: Tensor, grid: GridTable, network: SurfaceNetwork, hidden: Tensor, output: Tensor
     ) -> Tensor:
-        store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), *hidden.shape)
+        store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), len(hidden), len(grid.resolutions))
         out = torch.empty(len(positions))
         surface.surface_forward(_array(positions), _arrays(grid), _arrays(network), keep, store.arrays, out.numpy())
         if keep:
@@ -132,7 +142,7 @@ class _Value(torch.autograd.Function):
         if grid.table.requires_grad:
             surface.surface_scatter(count, table, arrays, _table_gradient(grid.table))
         ctx.store = None
-        return None, positions, None, None, *_summed(arrays, -(-count // POINTS))
+        return None, positions, None, None, *_summed(arrays, -(-count // POINTS), hidden)
 
 
 def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
@@ -157,8 +167,7 @@ class _Trace(torch.autograd.Function):
         grid, network, appearance, states, rays, sampling = parameters
         count, levels = len(origins), len(appearance.resolutions)
         chunks = -(-count // CHUNK)
-        units, width = hidden.shape
-        store = ray_store(chunks if keep else get_num_threads(), units, width, levels)
+        store = ray_store(chunks if keep else get_num_threads(), len(hidden), len(grid.resolutions), levels)
         features = torch.empty(2, count, FEATURES * levels)
         weight, distance, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
@@ -196,7 +205,7 @@ class _Trace(torch.autograd.Function):
             gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
             tracing_gradients.trace_scatter(count, table, look, arrays, *gradients)
         ctx.store = None
-        return None, *to_rays, *_summed(arrays, -(-count // CHUNK)), None
+        return None, *to_rays, *_summed(arrays, -(-count // CHUNK), hidden), None
 
 
 def compare(
@@ -312,20 +321,26 @@ def learn(
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), get_num_threads()
     tasks = chunks + -(-points // learning.POINTS)
-    units, width = network.hidden.shape
-    features, hidden = light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions), len(light.first)
+    units, levels = len(network.hidden), len(grid.resolutions)
+    features, hidden = (
+        light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions),
+        len(light.first),
+    )
     used = light.used.numpy()
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
     lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining = LightNetwork(*(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:]))
+    shining = LightNetwork(
+        *(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:])
+    )
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
         gain = of_frames[gains.frame.numpy()]
-    store, taps = ray_store(chunks, units, width, len(appearance.resolutions)), tap_store(tasks, units, width)
+    store, taps = ray_store(threads, units, levels, len(appearance.resolutions)), tap_store(tasks, units, levels)
+    kept = table_store(chunks, units, levels, len(appearance.resolutions))
     weights = shading_store(max(chunks, threads), shader)
-    scratch = chunk_scratch(threads, features, len(columns), hidden)
+    scratch = chunk_scratch(threads, units, features, len(columns), hidden)
     out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
     squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
     g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
@@ -333,14 +348,14 @@ def learn(
     table, look = _arrays(grid), _arrays(appearance)
     learning.learn_rays(
         threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining, lamps,
-        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, taps.arrays,
+        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays, taps.arrays,
         weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
     gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
-    learning.learn_tables(threads, next_task, count, points, table, look, store.arrays, taps.arrays, *gradients)
-    of_rays, of_points = store.arrays, taps.arrays
-    _add_gradient(network.hidden, of_rays.hidden_out[:chunks].sum(0) + of_points.hidden_out[:tasks].sum(0))
-    _add_gradient(network.output, of_rays.output_out[:chunks].sum(0) + of_points.output_out[:tasks].sum(0))
+    learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
+    for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
+        for weight, gradient in zip((network.hidden, network.output), _of_weights(arrays, parts, network.hidden), strict=True):
+            _add_gradient(weight, gradient)
     for name, weight in shader._asdict().items():
         whole = getattr(weights.arrays, f"{name}_out")[:chunks].sum(0)
         _add_gradient(weight, whole[tuple(slice(n) for n in weight.shape)])

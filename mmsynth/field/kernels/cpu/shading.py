@@ -4,7 +4,7 @@ Work is cut into chunks of ``CHUNK`` rays; what they meet passes the layers of t
 needs few of the shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights
 are summed per chunk and the chunks in order, whatever the number of threads.
 
-Matrices have whole tiles: they are padded with zeros, rows to a multiple of ``TILE_ROWS``, columns to one of ``TILE_COLS``.
+Matrices have whole tiles, see ``matrices``: they are padded with zeros.
 """
 
 from __future__ import annotations
@@ -13,89 +13,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import get_thread_id, njit, prange, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import get_thread_id, njit, prange
 
 from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
-from mmsynth.field.kernels.cpu.blocks import splat
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
 
 CHUNK = 64  # rays
-TILE_ROWS, TILE_COLS = 4, 16
 _HUBER = np.float32(HUBER_DELTA)
 _FAST = {"contract", "reassoc", "nsz", "arcp"}  # but NaN stays NaN: a loss that is not finite must be seen
-_VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
-_BYTE, _I64 = ir.IntType(8), ir.IntType(64)
-
-
-@intrinsic
-def _add_tile(typingctx, a, b, out, row, inner, column):  # type: ignore[no-untyped-def]
-    """out += a @ b, for the tile of ``out`` that begins at (row, column). Its sums stay in registers: LLVM would not find that."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        row, inner, column = args[3:]
-        zero = ir.Constant(_I64, 0)
-        rows = [ir.Constant(_I64, r) for r in range(TILE_ROWS)]
-
-        def element(which, i, j):  # type: ignore[no-untyped-def]
-            """Address of an element, and its array's strides."""
-            array = context.make_array(signature.args[which])(context, builder, args[which])
-            strides = cgutils.unpack_tuple(builder, array.strides, 2)
-            data = builder.bitcast(array.data, _BYTE.as_pointer())
-            return builder.gep(data, [builder.add(builder.mul(i, strides[0]), builder.mul(j, strides[1]))]), *strides
-
-        def after(address, stride, count, kind):  # type: ignore[no-untyped-def]
-            return builder.bitcast(builder.gep(address, [builder.mul(stride, count)]), kind.as_pointer())
-
-        left, down, along = element(0, row, zero)
-        right, onward, _ = element(1, zero, column)
-        tile, across, _ = element(2, row, column)
-        targets = [after(tile, across, r, _VECTOR) for r in rows]
-        sums = [cgutils.alloca_once_value(builder, builder.load(target, align=4)) for target in targets]
-        with cgutils.for_range(builder, inner) as loop:
-            vector = builder.load(after(right, onward, loop.index, _VECTOR), align=4)
-            values = builder.gep(left, [builder.mul(along, loop.index)])
-            for r, total in zip(rows, sums, strict=True):
-                value = splat(builder, builder.load(after(values, down, r, ir.FloatType())), _VECTOR)
-                product = builder.fmul(value, vector, flags=("contract",))
-                builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
-        for target, total in zip(targets, sums, strict=True):
-            builder.store(builder.load(total), target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(a, b, out, row, inner, column), codegen
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def]
-    """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
-    for row in range(0, rows, TILE_ROWS):
-        for column in range(0, columns, TILE_COLS):
-            _add_tile(a, b, out, row, inner, column)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def clear(out, rows, columns):  # type: ignore[no-untyped-def]
-    for i in range(rows):
-        for j in range(columns):
-            out[i, j] = np.float32(0.0)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def whole(count, of):  # type: ignore[no-untyped-def]
-    """``count`` rounded up to a multiple."""
-    return (count + of - 1) // of * of
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def padded(matrix):  # type: ignore[no-untyped-def]
-    """A copy of whole tiles, whichever way round it is used."""
-    out = np.zeros((whole(matrix.shape[0], TILE_COLS), whole(matrix.shape[1], TILE_COLS)), np.float32)
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            out[i, j] = matrix[i, j]
-    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
