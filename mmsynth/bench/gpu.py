@@ -1,4 +1,5 @@
-"""``mmsynth bench gpu``: what the GPU kernels take of a GPU, found without one: registers, spills and shared memory as the compiler says.
+"""``mmsynth bench gpu``: what the GPU kernels take of a GPU, found without one: registers, spills and shared memory as the compiler says,
+launches of a step as they are counted (``launches``), and what binds them on paper (``roofline``).
 
 Launches are recorded instead of run: what a kernel is compiled for follows from the arguments of real calls. No kernel's result decides
 what is launched next, so calls on CPU tensors launch all that calls on a GPU would.
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from mmsynth.bench.machine import measure
 from mmsynth.bench.output import Report, write_report
+from mmsynth.bench.roofline import roofline_table
 from mmsynth.bench.tables import Column, Table
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
@@ -174,8 +176,14 @@ def bench_gpu(out: Path, targets: Sequence[int] = tuple(TARGETS)) -> Report:
         import triton
     except ImportError:
         raise InputError("bench gpu: triton is not installed; pip install triton==3.6.0.") from None
-    rows = resource_rows([launch for call in calls() for launch in launches_of(call)], targets)
+    from mmsynth.bench.launches import device_step, example_trainer, launch_table, step_launches
+
+    trainer = example_trainer()
+    launches = [launch for call in calls() for launch in launches_of(call)]
+    known = {launch.name for launch in launches}
+    launches += [launch for launch in step_launches(device_step(trainer, 3), True, outside=True).calls if launch.name not in known]
+    rows = resource_rows(launches, targets)
     names = ", ".join(f"sm_{t} ({TARGETS.get(t, '')})" for t in targets)
     table = Table("Kernels", _COLUMNS, rows, f"Compiled by triton {triton.__version__} for {names}. At most 255 registers a thread.")
     results = {"bench": "gpu", "machine": measure(), "triton": triton.__version__, "rows": rows}
-    return write_report(results, [table], None, out)
+    return write_report(results, [table, launch_table(trainer), roofline_table()], None, out)

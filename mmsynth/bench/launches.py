@@ -15,8 +15,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mmsynth.bench.gpu import Launch, recorded_launches
 from mmsynth.bench.tables import Column, Table
 from mmsynth.fitting.device_step import DeviceStep
+from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
+from mmsynth.packaged import data_folder
+from mmsynth.scene.load import load_scene
 
 _READS = {"item", "tolist", "numpy", "cpu", "__bool__", "__int__", "__float__", "__index__", "__array__"}
 _WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "unique_dim", "_unique2", "repeat_interleave"}
@@ -85,6 +88,12 @@ def count(work: Callable[[], Any]) -> Counted:
     return counted
 
 
+def example_trainer() -> Trainer:
+    """A fit of the example, which has five sensors, polarization among them, and may have lamps."""
+    recipe = Recipe().with_changes({"radiance.light": "on"})
+    return Trainer(load_scene(data_folder("example_scene")), recipe, steps=100, budget=None, seed=0, device="cpu")
+
+
 def device_step(trainer: Trainer, lamps: int) -> DeviceStep:
     """The steps of a fit as its GPU would take them, of a field with so many lamps."""
     light = trainer.field.light
@@ -130,7 +139,7 @@ def launch_table(trainer: Trainer) -> Table:
         Column("Waits of the host", "waits", "d"),
     )  # fmt: skip
     note = (
-        "Of one step, all of which but one kernel is a CUDA graph. Every 16 steps the host copies what it is told, without waiting; the odds "
-        "of tiles are renewed every 16 steps, the occupancy every 32, and those wait."
+        "Of one step, all of which but one kernel is a CUDA graph. Every 16 steps the host copies what it is told, without waiting; the "
+        "odds of tiles are renewed every 16 steps, the occupancy every 32, and those wait."
     )
     return Table("Launches of a step", columns, rows, note)

@@ -130,6 +130,7 @@ class DeviceStep:
         self.flat, self.begins = self._flatten()
         self.rates = {n: torch.full((1,), adam.rates[n], device=device) for n in _TABLES}
         self.works: dict[Stage, Repeated] = {}
+        self.pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
         self.tables: list[int] = []
         self.lamps: tuple[int, ...] = ()
         self.renew()
@@ -194,7 +195,7 @@ class DeviceStep:
             number: of the step, for its random numbers. factor: of all learning rates. surface_factor: of the surface's, beside.
         """
         if stage not in self.works:
-            self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture)
+            self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture, self.pool)
         key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
         stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, surface_factor, key)
         self.works[stage]()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -15,10 +16,11 @@ class Repeated:
 
     Args:
         work: launches kernels and reads nothing back; what it makes on its way is used within it alone.
+        pool: memory that graphs share of which one runs at a time, ``torch.cuda.graph_pool_handle``; None: its own.
     """
 
-    def __init__(self, work: Callable[[], None], device: torch.device, capture: bool = True) -> None:
-        self.work, self.device, self.capture = work, device, capture and device.type == "cuda"
+    def __init__(self, work: Callable[[], None], device: torch.device, capture: bool = True, pool: Any = None) -> None:
+        self.work, self.device, self.capture, self.pool = work, device, capture and device.type == "cuda", pool
         self.graph: torch.cuda.CUDAGraph | None = None
         self.calls = 0
 
@@ -30,6 +32,6 @@ class Repeated:
         with torch.cuda.device(self.device):
             if self.graph is None:
                 self.graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(self.graph):  # records, and does nothing yet
+                with torch.cuda.graph(self.graph, pool=self.pool):  # records, and does nothing yet
                     self.work()
             self.graph.replay()

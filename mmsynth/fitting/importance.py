@@ -40,6 +40,9 @@ class Importance:
 
     def learn(self, tile: Tensor, residual: Tensor) -> None:
         """Take in the relative residuals of rays that were drawn, (R,) each."""
+        if self.residuals.device.type != "cpu":
+            self.residuals[tile] = KEPT * self.residuals[tile] + (1.0 - KEPT) * residual
+            return
         held, at = self.residuals.numpy(), tile.numpy()
         held[at] = KEPT * held[at] + (1.0 - KEPT) * residual.numpy()  # of several rays in a tile the last one counts: torch does not say
 

@@ -49,6 +49,23 @@ def test_a_step_launches_few_kernels_and_waits_for_none(lamps: int, decided: boo
     assert counted.triton["mirror_backward"] == (lamps > 0) and counted.triton["gains"] == decided
 
 
+@needs_triton
+@pytest.mark.slow
+def test_its_kernels_compile_for_hopper() -> None:
+    """To machine code, without spills but for a few numbers of ``compare``, the largest."""
+    from mmsynth.bench.gpu import compiled
+    from mmsynth.bench.launches import device_step, step_launches
+
+    calls = {launch.name: launch for launch in step_launches(device_step(_trainer(), 2), True).calls}
+    assert {"draw", "aim", "points", "compare", "mirror", "mirror_backward", "light_backward", "check", "guarded_adam", "tally"} <= set(
+        calls
+    )
+    for name in set(calls) - {"march", "weigh", "look", "gradient", "surface_backward", "look_backward", "weigh_backward"}:
+        found, result = compiled(calls[name], 90)
+        assert result.asm["cubin"] and 0 < found.registers <= 255
+        assert found.spilled <= (512 if name == "compare" else 0), (name, found)
+
+
 def test_numbers_of_rays_come_in_steps() -> None:
     counts = {bucket(rays) for rays in np.geomspace(1000, 64000, 500)}
     assert len(counts) <= 26 and all(abs(bucket(rays) / rays - 1) < 0.1 for rays in (1000, 12345, 65536))

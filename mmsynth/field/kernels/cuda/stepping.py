@@ -35,10 +35,11 @@ def numbers_kernel(sharpness, step, factors, key, a, b, c, d, first, second, thi
     tl.store(step, b)
     tl.store(factors, c)
     tl.store(factors + 1, d)
-    tl.store(key, first)
-    tl.store(key + 1, second)
-    tl.store(key + 2, third)
-    tl.store(key + 3, fourth)
+    # signed here, so that there is one kernel for all of them
+    tl.store(key, first & 0xFFFFFFFF)
+    tl.store(key + 1, second & 0xFFFFFFFF)
+    tl.store(key + 2, third & 0xFFFFFFFF)
+    tl.store(key + 3, fourth & 0xFFFFFFFF)
 
 
 def new_numbers(device: torch.device) -> Numbers:
@@ -49,7 +50,8 @@ def new_numbers(device: torch.device) -> Numbers:
 def set_numbers(numbers: Numbers, sharpness: float, step: float, factor: float, surface_factor: float, key: Sequence[int]) -> None:
     """By arguments of a kernel, which are on their way when this returns: nothing waits, and nothing is overwritten too early."""
     with torch.cuda.device_of(numbers.key):
-        numbers_kernel[(1,)](*numbers, sharpness, step, factor, factor * surface_factor, *key)
+        signed = (word - (word >> 31 << 32) for word in key)
+        numbers_kernel[(1,)](*numbers, sharpness, step, factor, factor * surface_factor, *signed)
 
 
 @jit
