@@ -35,11 +35,10 @@ def numbers_kernel(sharpness, step, factors, key, a, b, c, d, first, second, thi
     tl.store(step, b)
     tl.store(factors, c)
     tl.store(factors + 1, d)
-    # signed here, so that there is one kernel for all of them
-    tl.store(key, first & 0xFFFFFFFF)
-    tl.store(key + 1, second & 0xFFFFFFFF)
-    tl.store(key + 2, third & 0xFFFFFFFF)
-    tl.store(key + 3, fourth & 0xFFFFFFFF)
+    tl.store(key, first)
+    tl.store(key + 1, second)
+    tl.store(key + 2, third)
+    tl.store(key + 3, fourth)
 
 
 def new_numbers(device: torch.device) -> Numbers:
@@ -50,7 +49,7 @@ def new_numbers(device: torch.device) -> Numbers:
 def set_numbers(numbers: Numbers, sharpness: float, step: float, factor: float, surface_factor: float, key: Sequence[int]) -> None:
     """By arguments of a kernel, which are on their way when this returns: nothing waits, and nothing is overwritten too early."""
     with torch.cuda.device_of(numbers.key):
-        signed = (word - (word >> 31 << 32) for word in key)
+        signed = (word - (word >> 31 << 32) for word in key)  # the same bits, and one kernel for all of them
         numbers_kernel[(1,)](*numbers, sharpness, step, factor, factor * surface_factor, *signed)
 
 
