@@ -20,7 +20,6 @@ from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
 from mmsynth.field.storage import load_field
-from mmsynth.field.surface import Surface
 from mmsynth.fitting import run as run_module
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.device import pick_device
@@ -473,25 +472,16 @@ def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Calla
 
 
 @pytest.mark.parametrize("background", ["off", "on"])
-def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, monkeypatch: pytest.MonkeyPatch, background: str) -> None:
+def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, background: str) -> None:
     trainer = _trainer(scene, **{"surface.background": background})
-    asked: list[torch.Tensor] = []
-    gradient = Surface.gradient
-
-    def listen(self: Surface, positions: torch.Tensor, *rest: Any) -> torch.Tensor:
-        asked.append(positions)
-        return gradient(self, positions, *rest)
-
-    monkeypatch.setattr(Surface, "gradient", listen)
-    trainer.run_step()
-    (points,) = asked
-    assert points.shape == (128, 3)
-    extent = trainer.field.surface.grid.extent
-    assert extent == (2.0 if background == "on" else 1.0)
-    assert (points[:32].abs() <= extent).all() and points[:32].abs().max() > 0.8 * extent
-    # a new field is spheres of 0.3 and 1.8, 1 / 20 soft; the contracted frame is the one of the grids
-    apart = (points[32:].norm(dim=1)[:, None] - torch.tensor([0.3, 1.8 if background == "on" else 0.3])).abs().amin(1)
-    assert (apart < 0.6).all() and apart.median() < 0.2
+    sampling = sampling_at(0.0, trainer.recipe, trainer.needs)
+    asked = trainer._eikonal(500, sampling, torch.Generator().manual_seed(0))
+    grid = trainer.field.surface.grid
+    assert grid.extent == (2.0 if background == "on" else 1.0)
+    assert asked.points.shape == (32, 3) and asked.noise.shape == (96, 3)
+    assert (asked.points.abs() <= grid.extent).all() and asked.points.abs().max() > 0.8 * grid.extent
+    assert float(asked.noise.std()) == pytest.approx(3.0 / sampling.sharpness, rel=0.1)  # within the soft surface
+    assert asked.weight == SMALL.loss.eikonal_weight and asked.epsilon == grid.cell(sampling.active_surface)
 
 
 # --- what is built

@@ -80,8 +80,8 @@ def learn(
 
 
 def with_far_light(hits: Hits, far_light: Tensor) -> Hits:
-    """What is shaded. Light from beyond everything has features (F,), too, and no place: only a direction; it is mixed into the last surface
-    of each ray, so that no ray ends in the dark. Without any (0,) hits stay as they are."""
+    """What is shaded. Light from beyond everything has features (F,), too, and no place: only a direction; it is mixed into the last
+    surface of each ray, so that no ray ends in the dark. Without any (0,) hits stay as they are."""
     if not len(far_light):
         return hits
     last = torch.where(hits.behind >= 0, hits.behind, torch.arange(len(hits.behind), device=hits.behind.device))

@@ -176,9 +176,10 @@ class LightNetwork(NamedTuple):
     """Lamps, and a hidden layer that tells from features how surfaces mirror them; weights (out, in), biases (out,).
 
     Attributes:
-        second, second_bias: 5 + L outputs: roughness, strength, surroundings, transmitted, polarizing, and the visibility of each of L lamps.
-        position: (L, 3), normalised frame. log_spectrum: (L, outputs of the shader). used: (K,) int64, ascending: the lamps that there are;
-            none: surfaces do not shine, and nothing here is asked.
+        second, second_bias: 5 + L outputs: roughness, strength, surroundings, transmitted, polarizing, and the visibility of each of L
+            lamps.
+        position: (L, 3), normalised frame. log_spectrum: (L, outputs of the shader). used: (K,) int64, ascending: the lamps that there
+            are; none: surfaces do not shine, and nothing here is asked.
     """
 
     first: Tensor
@@ -216,9 +217,10 @@ class Eikonal(NamedTuple):
     """Where |∇sdf| = 1 is asked for: at points of all space and, of the surfaces that rays meet, at all if they shine, else at some.
 
     Attributes:
-        points: (P, 3), frame of the grid. noise: (Q, 3): of Q of the R rays, evenly spaced, how far from the surface they meet they ask, where
-            it does not shine. weight: of the term, a mean over P + Q, or P + R where surfaces shine. epsilon, mirror_epsilon: of the differences,
-            at points and where surfaces shine. shallow: factor, within the unit ball, where the slope is below 1 (not where surfaces shine).
+        points: (P, 3), frame of the grid. noise: (Q, 3): of Q of the R rays, evenly spaced, how far from the surface they meet they ask,
+            where it does not shine. weight: of the term, a mean over P + Q, or P + R where surfaces shine. epsilon, mirror_epsilon: of the
+            differences, at points and where surfaces shine. shallow: factor, within the unit ball, where the slope is below 1 (not where
+            surfaces shine).
     """
 
     points: Tensor

@@ -1,8 +1,9 @@
 """Blocks of positions through a hash grid and a small network, on the CPU: what the fused kernels are made of.
 
 A block is a matrix with a row for each of n positions: x, y and z, in the frame of the grid, 1 (so that biases are weights), and then the
-features of the levels; rows are as long as whole tiles (see ``matrices``). The features of a level are four numbers, one vector register, as
-is a row of its table: LLVM would not find that by itself, so reading, mixing and adding rows is written as vector instructions.
+features of the levels; rows are as long as whole tiles (see ``matrices``). The features of a level are four numbers, one vector
+register, as is a row of its table: LLVM would not find that by itself, so reading, mixing and adding rows is written as vector
+instructions.
 """
 
 from __future__ import annotations

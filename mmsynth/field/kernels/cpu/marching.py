@@ -68,8 +68,8 @@ def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted, skipped):  # type: ignore[no-untyped-def]
-    """t, position, distance from the centre, speed and state: at t where a surface may be there, else, with the state of a free cell, behind
-    that cell. skipped: whether the ray comes from one."""
+    """t, position, distance from the centre, speed and state: at t where a surface may be there, else, with the state of a free cell,
+    behind that cell. skipped: whether the ray comes from one."""
     grid = states.shape[0]
     half, width = np.float32(0.5 * grid / extent), np.float32(2.0 * extent / grid)
     x, y, z = ox + dx * t, oy + dy * t, oz + dz * t

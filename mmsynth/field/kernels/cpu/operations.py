@@ -16,9 +16,10 @@ from torch import Tensor
 
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
-from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, surface, tracing_gradients
-from mmsynth.field.kernels.cpu.learning import TableStore, TapStore
+from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
+from mmsynth.field.kernels.cpu.slopes import TapStore
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
     SurfaceStore,
@@ -320,19 +321,14 @@ def learn(
     """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), get_num_threads()
-    tasks = chunks + -(-points // learning.POINTS)
+    tasks = chunks + -(-points // slopes.POINTS)
     units, levels = len(network.hidden), len(grid.resolutions)
-    features, hidden = (
-        light.first.shape[1] if len(light.used) else appearance.table.shape[1] * len(appearance.resolutions),
-        len(light.first),
-    )
+    features, hidden = FEATURES * len(appearance.resolutions), len(light.first)
     used = light.used.numpy()
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
     lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining = LightNetwork(
-        *(_array(x) for x in light[:2]), _array(light.second)[columns], _array(light.second_bias)[columns], *map(_array, light[4:])
-    )
+    shining = _arrays(light._replace(second=light.second[columns], second_bias=light.second_bias[columns]))
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
@@ -347,8 +343,10 @@ def learn(
     next_task = np.zeros(1, np.int64)
     table, look = _arrays(grid), _arrays(appearance)
     learning.learn_rays(
-        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining, lamps,
-        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays, taps.arrays,
+        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining,
+        lamps,
+        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays,
+        taps.arrays,
         weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
     gradients = _table_gradient(grid.table), _table_gradient(appearance.table)

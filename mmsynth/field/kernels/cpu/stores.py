@@ -8,16 +8,18 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
-from mmsynth.field.kernels.cpu import learning, shading
-from mmsynth.field.kernels.cpu.learning import ChunkScratch, LightOut, TableStore, TapStore
+from mmsynth.field.kernels.cpu import shading
+from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CAPACITY, CHUNK
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS
+from mmsynth.field.kernels.cpu.mirrors import ChunkScratch, LightOut
+from mmsynth.field.kernels.cpu.slopes import MOST_TAPPED, TapStore
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
 _POOLED = 12
-_TAPS = 4 * learning.MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
+_TAPS = 4 * MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
 _pool: list[tuple[Any, Any]] = []
 
 
@@ -32,9 +34,10 @@ class SurfaceStore(NamedTuple):
 
 class RayStore(NamedTuple):
     """Of rays. Per sample, in the order of the blocks: block, hidden, sdf, ray_of, time_of. Per ray and number of the sample
-    (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), q_of (minus its slope over s), opacity_of (of the section that begins there), id_of (place in the order of the blocks); counts: samples
-    of each ray; second: the sample at which its second surface begins; samples: of all. Sections that matter: s_block (a block, too), s_ray,
-    s_k (its first sample), s_time, s_weight, s_count. The weights' gradients."""
+    (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), q_of (minus its slope over s), opacity_of (of the
+    section that begins there), id_of (place in the order of the blocks); counts: samples of each ray; second: the sample at which its
+    second surface begins; samples: of all. Sections that matter: s_block (a block, too), s_ray, s_k (its first sample), s_time, s_weight,
+    s_count. The weights' gradients."""
 
     block: np.ndarray
     hidden: np.ndarray
@@ -118,7 +121,8 @@ def ray_store(slots: int, units: int, levels: int, appearance_levels: int) -> St
     """The same, of rays with an appearance."""
     f, i, d, most = np.float32, np.int32, np.float64, CAPACITY
     lengths: dict[str, tuple[type, int]] = {
-        "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most), "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "q_of": (d, most), "opacity_of": (d, most),
+        "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most), "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "q_of": (d,
+        most), "opacity_of": (d, most),
         "id_of": (i, most), "counts": (i, CHUNK), "second": (i, CHUNK), "samples": (i, 1), "s_ray": (i, most), "s_k": (i, most),
         "s_time": (f, most), "s_weight": (f, most), "s_count": (i, 1),
     }  # fmt: skip
@@ -162,9 +166,11 @@ def chunk_scratch(slots: int, units: int, features: int, materials: int, hidden:
     three, some = (f, (rows, 3)), 2 * shading.CHUNK
     sizes: Sizes = {
         "hidden": (f, (_TAPS, whole(units))),
-        "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f, (CHUNK,)),
+        "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f,
+        (CHUNK,)),
         "behind": (np.int64, (CHUNK,)), "mixed": (f, (rows, features)), "mixed_share": (f, (rows,)), "g_features": (f, (rows, features)),
-        "g_share": (f, (rows,)), "material": (f, (rows, materials)), "normals": three, "points": three, "directions": three, "slopes": three,
+        "g_share": (f, (rows,)), "material": (f, (rows, materials)), "normals": three, "points": three, "directions": three,
+        "slopes": three,
         "g_material": (f, (rows, materials)), "g_normals": three, "mirror_share": (f, (rows,)), "g_mirror_share": (f, (rows,)),
         "at": three, "found": three, "row_of": (np.int64, (rows,)), "shallow": (f, (rows,)),
         "x": (f, (some, whole(features))), "h": (f, (some, whole(hidden))), "y": (f, (some, whole(materials))),
@@ -177,7 +183,8 @@ def light_out(slots: int, features: int, materials: int, hidden: int, lamps: int
     """Of chunks of such rays, K lamps and the shader's outputs."""
     f, whole = np.float32, _whole
     sizes: Sizes = {
-        "first": (f, (whole(hidden), whole(features))), "first_bias": (f, (whole(hidden),)), "second": (f, (whole(materials), whole(hidden))),
+        "first": (f, (whole(hidden), whole(features))), "first_bias": (f, (whole(hidden),)), "second": (f, (whole(materials),
+        whole(hidden))),
         "second_bias": (f, (materials,)), "position": (f, (lamps, 3)), "spectrum": (f, (lamps, outputs)), "far": (f, (features,)),
         "loss": (np.float64, ()),
     }  # fmt: skip
