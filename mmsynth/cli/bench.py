@@ -81,6 +81,14 @@ def bench_kernels(
     print_report(report, as_json)
 
 
+@command("gpu", of=bench_app)
+def bench_gpu(out: Annotated[Path, typer.Option()] = Path("bench/gpu"), as_json: JsonOption = False) -> None:
+    """What the GPU kernels take of a GPU, found without one: registers, spills and shared memory on sm_80, sm_90 and sm_100."""
+    from mmsynth.bench.gpu import bench_gpu as measure
+
+    print_report(measure(out), as_json)
+
+
 @command("ablation", of=bench_app)
 def bench_ablation(
     scene: SceneArgument,

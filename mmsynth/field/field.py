@@ -226,7 +226,7 @@ class Field(nn.Module):
     ) -> dict[str, Tensor]:
         """``shade_hits`` of measured modalities."""
         shaded, rays = self.with_far_light(hits), len(directions)
-        ray = kernels.rays_of(hits.behind)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
         lamps = self.light.lamps() if self.light is not None and self.shines and modalities else None
         mirrors = None if lamps is None else self.mirrors(hits, origins, directions, self.sampling.active_surface)[0]
         images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
@@ -300,7 +300,7 @@ class Field(nn.Module):
         """
         if self.light is None:
             raise ValueError("a field without light")
-        ray = kernels.rays_of(hits.behind)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
         points = origins[ray] + directions[ray] * hits.distance[:, None]
         slopes = self.slopes(points.detach(), active, MIRROR_CELLS)
         share = torch.where(hits.distance > 0, hits.share, torch.zeros_like(hits.share))  # without a place there is no normal

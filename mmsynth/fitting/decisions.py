@@ -74,7 +74,7 @@ def _degree(errors: Tensor, degree: int) -> Choice[int]:
 @torch.no_grad()
 def _exposure(field: Field, judged: Look, measurements: Measurements, recipe: RadianceRecipe) -> Choice[bool]:
     batch, hits = judged.batch, judged.hits
-    ray = kernels.rays_of(hits.behind)
+    ray = kernels.rays_of(hits.behind, len(hits.share))
     outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
     predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind) + judged.mirrored
     spreads = {}

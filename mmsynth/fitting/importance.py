@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mmsynth.field import kernels
 
-_KEPT = 0.8  # of a tile's residual when a ray of it was looked at
+KEPT = 0.8  # of a tile's residual when a ray of it was looked at
 
 
 class Importance:
@@ -40,8 +40,11 @@ class Importance:
 
     def learn(self, tile: Tensor, residual: Tensor) -> None:
         """Take in the relative residuals of rays that were drawn, (R,) each."""
+        if self.residuals.device.type != "cpu":
+            self.residuals[tile] = KEPT * self.residuals[tile] + (1.0 - KEPT) * residual
+            return
         held, at = self.residuals.numpy(), tile.numpy()
-        held[at] = _KEPT * held[at] + (1.0 - _KEPT) * residual.numpy()  # of several rays in a tile the last one counts: torch does not say
+        held[at] = KEPT * held[at] + (1.0 - KEPT) * residual.numpy()  # of several rays in a tile the last one counts: torch does not say
 
     def state_dict(self) -> dict[str, Any]:
         return {"residuals": self.residuals, "ends": self.selection.ends, "weight": self.selection.weight}

@@ -41,7 +41,7 @@ def _look(field: Field, measurements: Measurements, sampling: kernels.Sampling, 
     batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random)
     jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-    ray = kernels.rays_of(hits.behind)
+    ray = kernels.rays_of(hits.behind, len(hits.share))
     points = batch.origins[ray] + batch.directions[ray] * hits.distance[:, None]
     normals = field.normals(points, field.slopes(points, sampling.active_surface, MIRROR_CELLS))
     return _Look(batch, hits, points, normals, batch.directions[ray])

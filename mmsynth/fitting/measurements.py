@@ -332,8 +332,11 @@ def _with_levels(measurements: Measurements) -> Measurements:
 
 def _on(measurements: Measurements, device: torch.device | str) -> Measurements:
     move = lambda table: None if table is None else type(table)(*(x.to(device) for x in table))
-    tables = {f.name: move(getattr(measurements, f.name)) for f in fields(measurements) if f.name not in ("of", "order")}
-    return replace(measurements, **tables)
+    tables = {f.name: move(getattr(measurements, f.name)) for f in fields(measurements) if f.name not in ("of", "order", "frames")}
+    f = measurements.frames
+    buffer = f.codes8.to(device)  # once: the others are views of it
+    frames = kernels.Frames(*(x.to(device) for x in f[:-3]), buffer, buffer.view(torch.uint16), buffer.view(torch.float32))
+    return replace(measurements, frames=frames, **tables)
 
 
 def _rotations_origins(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

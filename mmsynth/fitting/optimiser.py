@@ -10,8 +10,8 @@ from torch import nn
 
 from mmsynth.field import kernels
 
-_BETAS = (0.9, 0.99)
-_EPSILON = 1e-15
+BETAS = (0.9, 0.99)
+EPSILON = 1e-15
 
 
 class Adam:
@@ -40,7 +40,7 @@ class Adam:
                 rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
                 met = slice((rows or {}).get(name))
                 first, second = self.moments[name]
-                step = kernels.AdamStep(rate, *_BETAS, _EPSILON, self.count, name in self.sparse)
+                step = kernels.AdamStep(rate, *BETAS, EPSILON, self.count, name in self.sparse)
                 parts.append((p[met], p.grad[met], first[met], second[met], step))
         kernels.adam_together(parts)
 

@@ -57,7 +57,7 @@ def ray_residuals(
     try:
         with torch.enable_grad():
             hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
-            shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind)
+            shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind, len(hits.share))
             outputs = field.shader(shaded.features, directions[ray], degrees[ray])
             predicted = kernels.predict(outputs, shaded.share, batch.measured, hits.behind)
             predicted = predicted + field.mirrored(hits, origins, directions, batch.measured, sampling.active_surface)

@@ -6,7 +6,7 @@ import functools
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -33,8 +33,12 @@ from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
 
+if TYPE_CHECKING:
+    from mmsynth.fitting.device_step import DeviceStep
+
 _GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
+_MOST_RAYS = 65536
 _OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (measured on one scene)
 _RENEW_EVERY = 16  # steps: where rays go
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
@@ -112,6 +116,14 @@ class Trainer:
         self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
         self.has_empty = self.measurements.empty is not None
+        self.on_device: DeviceStep | None = None
+        if self.device.type == "cuda" and kernels.fused_on_gpu():
+            from mmsynth.fitting.device_step import DeviceStep
+
+            given = self.field, self.measurements, self.importance, self.optimiser, self.log_gain, self.needs, recipe, seed
+            self.on_device = DeviceStep(*given)
+            self.state.rays = max(self.state.rays, self.on_device.first_rays)
+        self.prepared: tuple[Any, ...] = ()  # of the last step on the device, what was then
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -146,6 +158,9 @@ class Trainer:
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         sampling = sampling_at(self.progress, self.recipe, self.needs)
         self._prepare(sampling, generator)
+        if self.on_device is not None:
+            self._step_on(self.on_device, sampling)
+            return
         batch = self._draw(random)
         learned = self._learn(batch, sampling, random, generator)
         wrong = self._wrong(learned.loss)
@@ -160,10 +175,44 @@ class Trainer:
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(batch.origins)
         state.samples_total += samples
-        # a fixed number of samples a step; the number of rays follows, by at most a factor of two either way
-        ratio = min(2.0, max(0.5, self.recipe.sampling.samples_per_step / max(samples, 1)))
-        state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
+        self._adapt_rays(self.recipe.sampling.samples_per_step, samples, _MOST_RAYS)
         state.step += 1
+
+    def _adapt_rays(self, wanted: int, samples: float, most: int) -> None:
+        """A fixed number of samples a step: the number of rays follows, by at most a factor of two either way."""
+        ratio = min(2.0, max(0.5, wanted / max(samples, 1)))
+        self.state.rays = int(min(most, max(len(self.measurements), 0.5 * self.state.rays * (1 + ratio))))
+
+    def _step_on(self, step: DeviceStep, sampling: kernels.Sampling) -> None:
+        """A step that the device takes while the host goes on; what earlier ones told is taken in."""
+        state, done = self.state, self.progress
+        prepared = state.step // _RENEW_EVERY, state.light_looks, *(x is None for x in (state.tables, state.light, state.decided))
+        if prepared != self.prepared:
+            step.renew()
+            self.prepared = prepared
+        early = done < self.recipe.schedule.levels_until
+        stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
+        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
+        self._average()
+        state.rays_total += sum(stage.rays)
+        state.step += 1
+        self._hear(step, wait=False)
+
+    def _hear(self, step: DeviceStep, wait: bool) -> None:
+        """Take in what the device tells of the steps before."""
+        state, news = self.state, step.news(wait)
+        if news is None:
+            return
+        state.samples_total += news.samples
+        state.bad_steps += news.bad
+        if state.bad_steps >= _BAD_STEPS:
+            raise DivergedError(f"fit: loss or gradients are not finite in {state.bad_steps} steps (last: before step {state.step}).")
+        if news.steps > news.bad:
+            keep = 0.0 if math.isnan(state.mean_loss) else 0.98 ** (news.steps - news.bad)
+            state.mean_loss = news.loss if keep == 0.0 else keep * state.mean_loss + (1 - keep) * news.loss
+            for name, error in news.errors.items():
+                state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
+        self._adapt_rays(max(self.recipe.sampling.samples_per_step, step.samples), news.samples / news.steps, step.most_rays)
 
     def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
         """What is due before a step: the occupancy grid, where rays go, the rows of the tables, what residuals decide, the poses."""
@@ -224,11 +273,16 @@ class Trainer:
 
     def _update(self, sampling: kernels.Sampling) -> None:
         """A step of the optimiser, and of the mean over the last parameters."""
-        field, done, length = self.field, self.progress, self.recipe.schedule.ema_fraction
+        field, done = self.field, self.progress
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
         surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
         rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
         self.optimiser.step(learning_rate_factor(done, self.recipe), slower, rows)
+        self._average()
+
+    def _average(self) -> None:
+        """Take the parameters into the mean over the last ones, now and then at the end of a fit."""
+        done, length = self.progress, self.recipe.schedule.ema_fraction
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
@@ -352,6 +406,9 @@ class Trainer:
 
     def checkpoint(self) -> dict[str, Any]:
         """All state, as tensors and numbers."""
+        if self.on_device is not None:
+            self._hear(self.on_device, wait=True)
+            self.on_device.sync()
         parts = {name: part.state_dict() for name, part in self.parts.items()}
         return {"task": self.task, "log_gain": self.log_gain.detach(), "state": asdict(self.state), **parts}
 
@@ -375,6 +432,8 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
+        if self.on_device is not None:
+            self.on_device.resume()
         if self.state.decided is not None:
             self._see_directions(self.state.decided)
 

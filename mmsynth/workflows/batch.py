@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
@@ -73,7 +75,8 @@ def run_batch(
 ) -> dict[str, dict[str, Any]]:
     """Fit every scene and make its dataset, into ``<out>/NAME/run`` and ``<out>/NAME/dataset``; NAME/outcome.json says how it went.
 
-    What is finished is not made again, what was cut off goes on.
+    What is finished is not made again, what was cut off goes on. Under torchrun each process has its own scenes and, by LOCAL_RANK, its own
+    GPU; a scene that is too large for one GPU is not split over several.
 
     Args:
         part: the scenes of this process, None: all. say: told a line per scene.
@@ -90,6 +93,8 @@ def run_batch(
             say(f"{name}: {shown} dB on training pixels, {time.perf_counter() - began:.0f} s")
         except (InputError, DivergedError) as error:
             outcome = {"error": str(error)}
+        except torch.OutOfMemoryError:
+            outcome = {"error": f"{scene}: does not fit into the memory of one GPU, and a scene is not split over several."}
         except Exception as error:  # one scene must not take the others down, whatever it is
             outcome = {"error": f"{scene}: {type(error).__name__}: {error}"}
         if "error" in outcome:

@@ -158,7 +158,7 @@ def test_every_modality_has_the_view_dependence_that_it_needs() -> None:
     origins, directions, out = _look_around(field, 100)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((100,), 0.5), field.sampling)
     for name, degree in (("rgb", 0), ("nir", 3)):
-        ray = kernels.rays_of(hits.behind)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
         light = hits.share[:, None] * field.shader.values(name, field.shader(hits.features, directions[ray], degree))
         expected = torch.zeros(100, light.shape[1]).index_add(0, ray, light)
         torch.testing.assert_close(out[name], expected.detach(), atol=1e-6, rtol=1e-5)

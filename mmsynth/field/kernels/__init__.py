@@ -82,6 +82,7 @@ __all__ = [
     "contract",
     "contracted_velocity",
     "draw",
+    "fused_on_gpu",
     "hash_encode",
     "intensity",
     "learn",
@@ -111,6 +112,11 @@ def _on_gpu() -> ModuleType:
     if not can:
         print(f"GPU kernels unavailable ({why}): using torch operations", file=sys.stderr, flush=True)
     return cuda if can else reference
+
+
+def fused_on_gpu() -> bool:
+    """Whether Triton serves this machine's GPU."""
+    return _on_gpu() is not reference
 
 
 def _backend(tensor: Tensor) -> ModuleType:

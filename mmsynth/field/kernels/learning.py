@@ -58,7 +58,7 @@ def learn(
     """
     count = len(rays.origins)
     hits = reference.trace(grid, network, appearance, states, rays, sampling)
-    ray = rays_of(hits.behind)
+    ray = rays_of(hits.behind, len(hits.share))
     gain = torch.exp(gains.log_gain - gains.log_gain.mean())[gains.frame] if len(gains.log_gain) else None
     mirrored, slopes, shallow = None, *_at_points(hits, grid, network, rays, eikonal)
     if len(light.used):

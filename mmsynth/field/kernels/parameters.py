@@ -94,7 +94,8 @@ class Samples(NamedTuple):
 class Hits(NamedTuple):
     """What R rays meet: a surface each, and where that covers a pixel in part, at silhouettes and thin parts, what is behind it.
 
-    A row is one surface on one ray: the nearest of each ray, in the order of the rays, and then those behind them, H in all.
+    A row is one surface on one ray: the nearest of each ray, in the order of the rays, and then those behind them, H in all; on a GPU H is
+    2 R, and row R + r is of ray r, zeros where nothing is.
 
     Attributes:
         features: (H, F), the mean over the surface. share: (H,), of the light of its ray. distance: (H,), its mean ray
