@@ -12,7 +12,7 @@ from mmsynth.field import kernels
 from mmsynth.field.kernels.constants import WORD
 
 _MOST = 1 << 18  # of a modality
-_LOOKS = 30.0  # rays that a tile gets in a fit, on the average: enough to know its residual
+_LOOKS = 8.0  # rays that a tile gets in a fit, at the least: some more than its residual remembers
 
 
 class Tile(NamedTuple):
