@@ -35,7 +35,7 @@ class Importance:
 
     def renew(self) -> None:
         """Draw from now on by what was learned until now."""
-        ends, weight = kernels.odds(self.residuals, self.selection.count, self.first_tile, self.evenly)
+        ends, weight = kernels.odds(self.residuals, self.selection.pixels, self.first_tile, self.evenly)
         self.selection = self.selection._replace(ends=ends, weight=weight)
 
     def learn(self, tile: Tensor, residual: Tensor) -> None:

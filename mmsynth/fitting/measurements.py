@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, MaskMeaning, Region, Scene, Sensor
 from mmsynth.sensors.camera import Camera
 
+Table = TypeVar("Table", kernels.Frames, kernels.Cameras, kernels.Modalities, kernels.Selection)
 _TYPICAL = 1 << 18  # pixels, by which the level of a modality is known
 
 
@@ -221,7 +223,7 @@ def measure(
             raise InputError(f"{name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
         masked = 0 if masks == "off" else sum(f.mask is not None for f in of_sensor)
         inside, outside = _inside_outside(of_sensor, usable, masks if masked else "off", tiles[n])
-        if not inside.count.any():
+        if not inside.pixels.any():
             raise InputError(
                 f"{of_sensor[0].mask}: this mask of {name} and those of all its other training frames are empty, "
                 "expected pixels that are not zero."
@@ -232,8 +234,8 @@ def measure(
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
         own = slice(first_frame[n], first_frame[n + 1])
         of[name] = Modality(
-            sensor, cameras[n], index, *_rotations_origins(poses), stored.digest[own], totals[n], int(inside.count.sum()),
-            int(outside.count.sum()), masked, has_alpha=bool((stored.stride[own] > _values(sensor)).any()),
+            sensor, cameras[n], index, *_rotations_origins(poses), stored.digest[own], totals[n], int(inside.pixels.sum()),
+            int(outside.pixels.sum()), masked, has_alpha=bool((stored.stride[own] > _values(sensor)).any()),
         )  # fmt: skip
     pairs = [(tile, f.camera) for tile, of_sensor in zip(tiles, listed, strict=True) for f in of_sensor]
     first_tile = _begins(math.prod(tile.down_across(c.height, c.width)) for tile, c in pairs)
@@ -278,12 +280,13 @@ def _inside_outside(frames: Sequence[Frame], usable: Sequence[np.ndarray | None]
     """
     shapes = [(f.camera.height, f.camera.width) for f in frames]
     none = all_pixels(shapes, tile)
-    none = none._replace(count=np.zeros_like(none.count))
+    none = none._replace(pixels=np.zeros_like(none.pixels))
     if masks == "off" and all(rays is None for rays in usable):
         return all_pixels(shapes, tile), none
 
     def of_frame(i: int) -> tuple[Tiled, Tiled | None]:
-        rays = np.ones(shapes[i], bool) if usable[i] is None else usable[i]
+        has_ray = usable[i]
+        rays = np.ones(shapes[i], bool) if has_ray is None else has_ray
         mask = None if masks == "off" else read_mask(frames[i])
         if mask is None:
             learned = rays if masks != "object" else np.zeros_like(rays)
@@ -331,12 +334,17 @@ def _with_levels(measurements: Measurements) -> Measurements:
 
 
 def _on(measurements: Measurements, device: torch.device | str) -> Measurements:
-    move = lambda table: None if table is None else type(table)(*(x.to(device) for x in table))
-    tables = {f.name: move(getattr(measurements, f.name)) for f in fields(measurements) if f.name not in ("of", "order", "frames")}
-    f = measurements.frames
+    m, f = measurements, measurements.frames
     buffer = f.codes8.to(device)  # once: the others are views of it
     frames = kernels.Frames(*(x.to(device) for x in f[:-3]), buffer, buffer.view(torch.uint16), buffer.view(torch.float32))
-    return replace(measurements, frames=frames, **tables)
+    return Measurements(
+        m.of, m.order, frames, _moved(m.cameras, device), _moved(m.modalities, device), _moved(m.chosen, device),
+        None if m.empty is None else _moved(m.empty, device),
+    )  # fmt: skip
+
+
+def _moved(table: Table, device: torch.device | str) -> Table:
+    return type(table)(*(x.to(device) for x in table))
 
 
 def _rotations_origins(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

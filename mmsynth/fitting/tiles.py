@@ -12,7 +12,7 @@ from mmsynth.field import kernels
 from mmsynth.field.kernels.constants import WORD
 
 _MOST = 1 << 18  # of a modality
-_LOOKS = 30.0  # rays that a tile gets in a fit, on the average: enough to know its residual
+_LOOKS = 8.0  # rays that a tile gets in a fit, at the least: some more than its residual remembers
 
 
 class Tile(NamedTuple):
@@ -27,9 +27,9 @@ class Tile(NamedTuple):
 
 
 class Tiled(NamedTuple):
-    """Chosen pixels of frames: ``count`` (T,) int32 of each tile, and ``words``, see ``kernels.Selection``, None where all are chosen."""
+    """Chosen pixels of frames: ``pixels`` (T,) int32, how many of each tile; ``words``, see ``kernels.Selection``, None: all are chosen."""
 
-    count: np.ndarray
+    pixels: np.ndarray
     words: np.ndarray | None
 
 
@@ -71,6 +71,6 @@ def selection_of(parts: Sequence[Tiled], first_tile: torch.Tensor) -> kernels.Se
     words = [np.empty(0, np.int32) if part.words is None else part.words for part in parts]
     begins = np.cumsum([0, *map(len, words)])[:-1]
     first_word = np.array([-1 if part.words is None else begin for part, begin in zip(parts, begins, strict=True)], np.int64)
-    count = torch.from_numpy(np.concatenate([part.count for part in parts]))
+    count = torch.from_numpy(np.concatenate([part.pixels for part in parts]))
     ends, weight = kernels.odds(torch.ones(len(count)), count, first_tile, 1.0)
     return kernels.Selection(ends, weight, count, torch.from_numpy(first_word), torch.from_numpy(np.concatenate(words)))

@@ -164,9 +164,9 @@ def test_the_kernel_draws_what_its_definition_says(
 ) -> None:
     tables = _scene()
     selection, _ = _selection(seed, share)
-    residual = torch.from_numpy(np.random.default_rng(seed).random(len(selection.count), np.float32))
-    ends, weight = kernels.odds(residual, selection.count, tables[2].first_tile, evenly)
-    of_reference = reference.odds(residual, selection.count, tables[2].first_tile, evenly)
+    residual = torch.from_numpy(np.random.default_rng(seed).random(len(selection.pixels), np.float32))
+    ends, weight = kernels.odds(residual, selection.pixels, tables[2].first_tile, evenly)
+    of_reference = reference.odds(residual, selection.pixels, tables[2].first_tile, evenly)
     assert (ends - of_reference[0]).abs().max() <= 1  # sums in another order
     torch.testing.assert_close(weight, of_reference[1], rtol=1e-4, atol=0)
     selection = selection._replace(ends=ends, weight=weight)

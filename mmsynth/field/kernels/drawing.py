@@ -55,8 +55,9 @@ def draw(
         number = torch.arange(begin, begin + count, device=frames.origin.device)
         parts.append(_drawn(frames, cameras, modalities, selection, n, drawn, number, key))
         begin += count
-    joined = [torch.cat(x) for x in zip(*(part[:-1] for part in parts), strict=True)]
-    return Drawn(*joined, Measured(*(torch.cat(x) for x in zip(*(part.measured for part in parts), strict=True))))
+    measured = Measured(*(torch.cat(x) for x in zip(*(part.measured for part in parts), strict=True)))
+    of_rays = {name: torch.cat([getattr(part, name) for part in parts]) for name in Drawn._fields if name != "measured"}
+    return Drawn(**of_rays, measured=measured)
 
 
 def _drawn(
@@ -111,7 +112,7 @@ def _pixel(
     down, across = (lambda local, columns: (local // columns, local % columns))(
         tile - frames.first_tile[frame], (width + tile_width - 1) // tile_width
     )
-    kth = bits * selection.count[tile].long() >> 32
+    kth = bits * selection.pixels[tile].long() >> 32
     if int(selection.first_word[n]) < 0:
         columns = torch.minimum(tile_width, width - across * tile_width)
         return down * tile_height + kth // columns, across * tile_width + kth % columns

@@ -329,14 +329,14 @@ class Selection(NamedTuple):
 
     Attributes:
         ends: (T,) int64, of 2³² random numbers, up to which one draws the tile; of each modality for itself, 2³² its last.
-        weight: (T,), of a ray, which makes up for how often its tile is drawn. count: (T,), pixels of the tile that may be drawn.
+        weight: (T,), of a ray, which makes up for how often its tile is drawn. pixels: (T,), of the tile, how many may be drawn.
         first_word: (N,) int64, of the modality in ``words``, -1 = all pixels may be drawn.
         words: (·,) int32, tile after tile: of each pixel, row by row, a bit, lowest first: whether it may be drawn.
     """
 
     ends: Tensor
     weight: Tensor
-    count: Tensor
+    pixels: Tensor
     first_word: Tensor
     words: Tensor
 

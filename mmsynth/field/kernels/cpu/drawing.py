@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from numba import njit, prange
 from mmsynth.field.kernels.constants import DRAW_JITTER, DRAW_PIXEL, DRAW_TILE, PURPOSE_STRIDE, WORD
 from mmsynth.field.kernels.parameters import Cameras, Drawn, Frames, Measured, Modalities, Selection
 
+P = TypeVar("P", bound=tuple[Any, ...])
 CHUNK = 64  # rays
 _u, _f = np.uint32, np.float32
 _ZERO, _ONE, _TWO, _THREE, _SIX = _f(0.0), _f(1.0), _f(2.0), _f(3.0), _f(6.0)
@@ -127,7 +129,7 @@ def draw_rays(frames, cameras, modalities, selection, rays, key, drawn, measured
             tile_height = np.int64(modalities.tile_height[n])
             tiles_across, local = (width + tile_width - 1) // tile_width, tile - frames.first_tile[frame]
             down, across = local // tiles_across, local % tiles_across
-            kth = (_bits(key, ray, DRAW_PIXEL) * np.int64(selection.count[tile])) >> 32
+            kth = (_bits(key, ray, DRAW_PIXEL) * np.int64(selection.pixels[tile])) >> 32
             columns, first_word = min(tile_width, width - across * tile_width), selection.first_word[n]
             if first_word >= 0:
                 per_tile = (tile_width * tile_height) // WORD
@@ -164,7 +166,7 @@ def draw_rays(frames, cameras, modalities, selection, rays, key, drawn, measured
                 ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
             for j in range(values):
                 number = numbers_begin + (ray - rays_begin) * values + j
-                channel = j
+                channel = np.int64(j)
                 if mosaic >= 0:
                     pattern_width = np.int64(modalities.pattern_width[n])
                     place = (row % np.int64(modalities.pattern_height[n])) * pattern_width + column % pattern_width
@@ -213,6 +215,10 @@ def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignor
             before = here
 
 
+def _arrays(table: P) -> P:
+    return type(table)(*(x.numpy() for x in table))
+
+
 def draw(
     frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
 ) -> Drawn:
@@ -225,9 +231,8 @@ def draw(
     measured = Measured(
         single(numbers), whole(numbers), whole(numbers), single(polarized, 3), single(numbers), single(numbers), single(numbers)
     )
-    arrays = (type(t)(*(x.numpy() for x in t)) for t in (frames, cameras, modalities, selection))
-    out = tuple(x.numpy() for x in drawn), Measured(*(x.numpy() for x in measured))
-    draw_rays(*arrays, np.array(rays), np.array(key), *out)
+    tables = _arrays(frames), _arrays(cameras), _arrays(modalities), _arrays(selection)
+    draw_rays(*tables, np.array(rays), np.array(key), tuple(x.numpy() for x in drawn), _arrays(measured))
     return Drawn(*drawn, measured)
 
 
