@@ -36,11 +36,11 @@ def _assert_near(found: dict[str, Tensor], expected: dict[str, Tensor], toleranc
         assert (found[name] - value).abs().max() < tolerance * (1e-3 + value.abs().max()), name
 
 
-@pytest.mark.parametrize(("hidden", "active", "extent"), [(32, 6, 1.0), (32, 3, 2.0), (20, 6, 2.0), (4, 0, 1.0)])
+@pytest.mark.parametrize(("hidden", "active", "extent"), [(32, 6, 1.0), (20, 5, 2.0), (4, 0, 1.0)])
 def test_surface_value_equals_the_network_with_all_gradients(device: str, hidden: int, active: int, extent: float) -> None:
     surface = _surface(device, hidden, extent)
     exact = copy.deepcopy(surface).double()
-    x = _positions(150, surface.grid).to(device).requires_grad_()
+    x = _positions(70, surface.grid).to(device).requires_grad_()
     y = x.detach().double().requires_grad_()
     found, expected = cuda.surface_value(x, *surface.at(active)), reference.surface_value(y, *exact.at(active))
     assert found.dtype == torch.float32
@@ -64,11 +64,11 @@ def _four_taps(positions: Tensor, epsilon: Tensor, surface: Surface, active: int
     return (values @ taps) * (3**0.5 / (4 * epsilon))[:, None]
 
 
-@pytest.mark.parametrize("sizes", ["one", "each", "some none"])
+@pytest.mark.parametrize("sizes", ["one", "some none"])
 def test_surface_gradient_equals_differences_with_all_gradients(device: str, sizes: str) -> None:
     surface = _surface(device, 20, 2.0)
     exact = copy.deepcopy(surface).double()
-    x = _positions(70, surface.grid).to(device).requires_grad_()
+    x = _positions(20, surface.grid).to(device).requires_grad_()
     y = x.detach().double().requires_grad_()
     epsilon = torch.full((len(x),), 0.05, device=device) if sizes == "one" else 0.02 + 0.1 * torch.rand(len(x), device=device)
     asked = torch.arange(len(x), device=device) % 3 > 0 if sizes == "some none" else torch.ones(len(x), dtype=torch.bool, device=device)
@@ -100,7 +100,7 @@ def test_gradients_of_tables_are_added_and_frozen_ones_stay(device: str) -> None
 
 def test_weights_have_the_same_bits_again(device: str) -> None:
     surface = _surface(device, 32, 1.0)
-    x = _positions(150, surface.grid).to(device)
+    x = _positions(70, surface.grid).to(device)
     bits = []
     for _ in range(2):
         surface.zero_grad()

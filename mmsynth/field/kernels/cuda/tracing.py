@@ -34,7 +34,6 @@ class _Traced(NamedTuple):
     second: Tensor
     touched: Tensor
     shown: Tensor
-    features: Tensor
     sharpness: Tensor
 
 
@@ -61,8 +60,9 @@ class _Trace(torch.autograd.Function):
         section_k = new(MAX_SAMPLES_PER_RAY, count, dtype=torch.int32)
         t = _Traced(
             new(3, MAX_SAMPLES_PER_RAY, count), counts, new(2, MAX_SAMPLES_PER_RAY, count), section_k, section_count, second, touched,
-            new(2 * count), new(2 * count, columns), sharpness,
+            new(2 * count), sharpness,
         )  # fmt: skip
+        features = new(2 * count, columns)
         share, distance, depth, opacity = new(2 * count), new(2 * count), new(count), new(count)
         behind = new(count, dtype=torch.int64)
         bent = grid.extent > 1.0
@@ -82,21 +82,21 @@ class _Trace(torch.autograd.Function):
                 )  # fmt: skip
                 look_kernel[(blocks, triton.cdiv(columns, COLUMNS.value))](
                     origins, directions, t.sections, t.section_k, t.section_count, t.second, t.shown,
-                    appearance.table.detach(), appearance.resolutions, appearance.offsets, t.features, 0.5 / appearance.extent,
+                    appearance.table.detach(), appearance.resolutions, appearance.offsets, features, 0.5 / appearance.extent,
                     count, columns, appearance.active, bent, appearance.table.shape[1], LANES, **OPTIONS,
                 )  # fmt: skip
         ctx.parameters = grid, network, appearance
         ctx.traced = t
-        ctx.save_for_backward(origins, directions, hidden, output)
+        ctx.save_for_backward(origins, directions, hidden, output, features)
         ctx.mark_non_differentiable(distance, behind, depth, samples := queue[1])
         ctx.set_materialize_grads(False)
-        return t.features, share, distance, behind, opacity, depth, samples
+        return features, share, distance, behind, opacity, depth, samples
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> Any:
         (grid, network, appearance), t = ctx.parameters, ctx.traced
-        origins, directions, hidden, output = ctx.saved_tensors
+        origins, directions, hidden, output, features = ctx.saved_tensors
         count, device = len(origins), origins.device
         g_features, g_share, g_opacity = (None if g is None else g.contiguous() for g in (gradients[0], gradients[1], gradients[4]))
         bent, to_rays = grid.extent > 1.0, ctx.needs_input_grad[0] or ctx.needs_input_grad[1]
@@ -112,9 +112,9 @@ class _Trace(torch.autograd.Function):
             with torch.cuda.device_of(origins):
                 if g_features is not None:
                     look_backward_kernel[(blocks,)](
-                        origins, directions, t.sections, t.section_k, t.section_count, t.second, t.shown, t.features, g_features,
+                        origins, directions, t.sections, t.section_k, t.section_count, t.second, t.shown, features, g_features,
                         appearance.table.detach(), appearance.resolutions, appearance.offsets, table_gradient(appearance.table),
-                        g_section, of_sections, 0.5 / appearance.extent, count, t.features.shape[1], appearance.active,
+                        g_section, of_sections, 0.5 / appearance.extent, count, features.shape[1], appearance.active,
                         bent, appearance.table.shape[1], LANES, **OPTIONS,
                     )  # fmt: skip
                 sections.weigh_backward_kernel[(blocks,)](
