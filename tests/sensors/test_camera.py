@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mmsynth.errors import InputError
+from mmsynth.sensors import camera as cameras
 from mmsynth.sensors import lenses
 from mmsynth.sensors.camera import Camera, Lens, project, project_points, ray_map, round_trip_error, unproject, unproject_points
 
@@ -239,3 +240,17 @@ def test_bad_intrinsics_are_refused() -> None:
         Camera(4, 3, 1.0, 1.0, 0.0, 0.0, (0.1, 0.2, 0.3, 0.4, 0.5), "kannala_brandt")
     with pytest.raises(InputError, match="lens 'omni'"):
         Camera(4, 3, 1.0, 1.0, 0.0, 0.0, (), "omni")  # type: ignore[arg-type]
+
+
+def test_rays_of_a_large_camera_are_those_of_its_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map that is made by bands, the last one cut off; one large camera is kept, and it is not written to."""
+    monkeypatch.setattr(cameras, "_SMALL", 64)
+    camera, other = (Camera(20, 11, 18.0, 18.0, cx, 5.0, (-0.4, 0.05, 0.001, -0.002)) for cx in (9.4, 9.9))
+    directions, valid = ray_map(camera)
+    v, u = np.mgrid[0:11, 0:20]
+    expected, seen = unproject(np.stack([u, v], -1).astype(float), camera)
+    np.testing.assert_allclose(directions, expected, atol=1e-14)
+    np.testing.assert_array_equal(valid, seen)
+    assert ray_map(camera)[0] is directions and not directions.flags.writeable
+    ray_map(other)
+    assert ray_map(camera)[0] is not directions
