@@ -93,6 +93,14 @@ def resized(camera: Camera, width: int, margin: int = 0) -> Camera:
     )
 
 
+def every_nth(camera: Camera, n: int) -> Camera:
+    """The photosites of every n-th row and column, from the first: pixel (i, j) has the ray of pixel (n i, n j)."""
+    of = lambda size: -(-size // n)
+    return replace(
+        camera, width=of(camera.width), height=of(camera.height), fx=camera.fx / n, fy=camera.fy / n, cx=camera.cx / n, cy=camera.cy / n
+    )
+
+
 def project_points(points: Tensor, intrinsics: Tensor, coefficients: Tensor, lens: Lens = "brown_conrady") -> tuple[Tensor, Tensor]:
     """Points in front of cameras → pixels.
 
@@ -199,12 +207,6 @@ def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.nd
     """Points that pixels see: depth along the ray (H, W) → (H, W, 3) float64, world, NaN where the depth is (kornia's is for pinholes)."""
     directions = ray_map(camera)[0] @ camera_to_world[:3, :3].T
     return camera_to_world[:3, 3] + directions * depth_ray[..., None].astype(np.float64)
-
-
-def depth_along_rays(camera: Camera, depth_z: np.ndarray) -> np.ndarray:
-    """Depth along the optical axis (H, W) → along the ray, float64; NaN where the ray does not lead forward."""
-    forward = ray_map(camera)[0][..., 2]
-    return depth_z.astype(np.float64) / np.where(forward > 0, forward, np.nan)
 
 
 def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:
