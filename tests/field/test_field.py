@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize, softplus
 
 from mmsynth.errors import InputError
+from mmsynth.field import field as fields
 from mmsynth.field import kernels, rendering
 from mmsynth.field.design import Design
 from mmsynth.field.field import Field
@@ -93,6 +94,22 @@ def test_only_what_is_asked_for_is_rendered() -> None:
         else:
             assert np.isnan(seen.normal).all()
     assert np.isfinite(whole.depth_ray).sum() > 20 and np.isfinite(whole.normal).sum() > 60
+
+
+def test_a_rendering_does_not_depend_on_how_many_rays_are_made_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, camera, pose = _field(False), Camera(19, 13, 12.0, 12.0, 7.5, 5.5, (-0.5, 0.1, 0.0, 0.0)), np.eye(4)
+    pose[2, 3] = -1.5
+    whole = field.render(camera, pose)
+    monkeypatch.setattr(fields, "TILE", 16)
+    monkeypatch.setattr(fields, "_TILES", 4)
+    done: list[int] = []
+    seen = field.render(camera, pose, progress=done.append)
+    assert sum(done) == whole.valid.sum() < whole.valid.size and max(done) == 16
+    for part in ("depth_z", "depth_ray", "opacity", "normal", "valid"):
+        np.testing.assert_allclose(getattr(seen, part), getattr(whole, part), atol=1e-6)
+    for name in whole.channels:
+        np.testing.assert_allclose(seen.channels[name], whole.channels[name], atol=1e-6)
+    np.testing.assert_allclose(seen.stokes["pol"], whole.stokes["pol"], atol=1e-6)
 
 
 def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
