@@ -10,7 +10,7 @@ from typing import Any
 from mmsynth.field.field import Field
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.run import fit
+from mmsynth.fitting.run import CHECKPOINT_EVERY, fit
 from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.progress import Progress
@@ -33,6 +33,7 @@ def fit_run(
     resume: bool = False,
     prior: Prior | None = None,
     exposure: Exposure | None = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
     on_field: Callable[[Path, Field], None] | None = None,
@@ -43,7 +44,7 @@ def fit_run(
         folder: None: a new one in ``runs``, or with ``resume`` the scene's run whose checkpoint is the newest. The others: see ``fit``;
             on_field is given the folder, too.
     Raises:
-        InputError: as ``fit``, or there is nothing to resume.
+        InputError: as ``fit``, or there is nothing to resume. Others: as ``fit``.
     """
     name = scene.root.resolve().name
     folder = folder or (run_to_resume(name) if resume else new_run(name))
@@ -58,6 +59,7 @@ def fit_run(
         resume=resume,
         prior=prior,
         exposure=exposure,
+        checkpoint_every=checkpoint_every,
         on_start=on_start,
         on_step=on_step,
         on_field=None if on_field is None else functools.partial(on_field, folder),
