@@ -154,9 +154,7 @@ def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("killed_at", [3, 9])
-def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
-    scene: Scene, tmp_path: Path, killed_at: int
-) -> None:
+def test_a_fit_killed_before_or_after_the_count_becomes_the_same(scene: Scene, tmp_path: Path, killed_at: int) -> None:
     recipe = Recipe().with_changes(SMALL)
     whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=16)
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 from conftest import ring
 
-from mmsynth.errors import DivergedError, InputError
+from mmsynth.errors import DivergedError, InputError, Interrupted
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
@@ -217,9 +217,7 @@ def test_the_log_of_a_resumed_fit_has_every_step_once(scene: Scene, tmp_path: Pa
     assert all(math.isfinite(x["loss"]) and set(x["psnr"]) == set(scene.sensors) for x in lines)
 
 
-def test_an_interrupted_fit_says_how_to_go_on(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_fit_says_how_to_go_on(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     step = Trainer.run_step
 
     def interrupted(self: Trainer) -> None:
