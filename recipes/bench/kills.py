@@ -57,11 +57,12 @@ def main(
         while fell.total() < kills:
             fits += 1
             run = work / f"runs/{fits}"
-            before = fell.total()
+            here: list[str] = []
             process = life(run.name)
-            while fell.total() < kills and _kill(process, run, rng, length):
-                fell[_where(run)] += 1
+            while fell.total() + len(here) < kills and _kill(process, run, rng, length):
+                here.append(_where(run))
                 process = life(run.name)
+            fell.update(here)
             said = process.communicate()[1]
             if process.returncode:
                 problems.append(f"fit {fits}: exit code {process.returncode}: {said}")
@@ -69,7 +70,7 @@ def main(
                 problems += [f"fit {fits}: {p}" for p in _differences(run, whole)]
             if (work / "runs/latest").resolve() != run.resolve():
                 problems.append(f"fit {fits}: runs/latest is not it")
-            print(f"fit {fits}: killed {fell.total() - before} times, {fell.total()} kills, {len(problems)} problems", flush=True)
+            print(f"fit {fits}: killed {', '.join(here) or 'never'}; {fell.total()} kills, {len(problems)} problems", flush=True)
     for where, count in fell.most_common():
         print(f"{count:4d}  {where}")
     print("\n".join(problems) if problems else f"{fell.total()} kills of {fits} fits: every field the same file, every checkpoint the same")
@@ -85,14 +86,14 @@ def _finish(process: subprocess.Popen[str]) -> None:
 def _kill(process: subprocess.Popen[str], run: Path, rng: random.Random, length: float) -> bool:
     """Kill it at a random moment; False where it was done before."""
     aim = None if rng.random() < _TIMED else rng.choice(_AIMS)
-    until = time.perf_counter() + rng.uniform(0.0, length * (1.0 if aim is None else 0.8))
-    while process.poll() is None:
-        if time.perf_counter() >= until and (aim is None or any(run.glob(aim))):
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-            return process.returncode == -signal.SIGKILL
-        time.sleep(0.0005)
-    return False
+    try:
+        process.wait(rng.uniform(0.0, length * (1.0 if aim is None else 0.8)))
+    except subprocess.TimeoutExpired:
+        pass
+    while process.poll() is None and aim is not None and not any(run.glob(aim)):
+        time.sleep(0.001)
+    process.kill()  # nothing where it is done
+    return process.wait() == -signal.SIGKILL
 
 
 def _where(run: Path) -> str:
