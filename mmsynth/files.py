@@ -39,6 +39,12 @@ def write_atomic(path: Path, write: Callable[[Path], Any]) -> None:
             temporary.unlink()
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that writers left in a folder when they were killed. Nobody else may be writing there."""
+    for left in folder.glob(".*.[0-9]*.tmp*"):
+        left.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write ``text`` as UTF-8, atomically."""
     write_atomic(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

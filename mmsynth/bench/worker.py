@@ -19,7 +19,7 @@ import torch
 
 from mmsynth.bench.jobs import scene_of, whole_scene_of
 from mmsynth.bench.machine import peak_memory
-from mmsynth.errors import DivergedError, InputError
+from mmsynth.errors import known_error
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_json
 from mmsynth.fitting.needs import Needs
@@ -91,9 +91,12 @@ def serve(work: Callable[[Mapping[str, Any], Path], dict[str, Any]]) -> None:
     task, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
     try:
         write_json(folder / "result.json", work(task, folder))
-    except (InputError, DivergedError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from None
+    except Exception as error:
+        known = known_error(error, "bench")
+        if known is None:
+            raise
+        print(f"error: {known}", file=sys.stderr)
+        raise SystemExit(known.exit_code) from None
 
 
 if __name__ == "__main__":

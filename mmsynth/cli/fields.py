@@ -26,6 +26,7 @@ from mmsynth.cli.arguments import (
     modality_names,
     modality_pairs,
     scene_path,
+    seconds_of,
     sensor_folders,
 )
 from mmsynth.cli.looking import LiveView, PortOption
@@ -80,6 +81,7 @@ def fit(
         typer.Option(help="file of one of the scene's sensors that --prior does not know, for its responses; once for each"),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
+    checkpoint_every: Annotated[str, typer.Option(help="time that a fit which is killed loses at most, e.g. 10s, 5m")] = "60s",
     device: DeviceOption = "auto",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     view: Annotated[bool, typer.Option("--view", help="show the field in the browser while it is learned")] = False,
@@ -102,7 +104,7 @@ def fit(
         from mmsynth.viewer.viewer import require_free
 
         require_free("127.0.0.1", port)
-    seconds = fit_length(steps, budget)
+    seconds, every = fit_length(steps, budget), seconds_of(checkpoint_every, "--checkpoint-every")
     stated = None if exposure is None else read_exposure(exposure)
     meaning, folder = masks_of(masks)
     read = load_scene(
@@ -133,7 +135,8 @@ def fit(
         live = LiveView(loaded, port, say) if view else None
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
-            prior=of_scenes, exposure=stated, on_load=on_load, on_start=lambda needs: explain(needs.choices), on_step=on_step,
+            prior=of_scenes, exposure=stated, on_load=on_load, checkpoint_every=every, on_start=lambda needs: explain(needs.choices),
+            on_step=on_step,
             on_field=live,
         )  # fmt: skip
         if live is not None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any
 
 import typer
 
-from mmsynth.errors import DivergedError, InputError
+from mmsynth.errors import Interrupted, known_error
 
 app = typer.Typer(
     add_completion=False,
@@ -30,17 +32,36 @@ def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]],
         @functools.wraps(function)
         def guarded(*args: Any, **kwargs: Any) -> None:
             try:
-                function(*args, **kwargs)
-            except (InputError, DivergedError) as error:
-                print(f"error: {error}", file=sys.stderr)
-                raise typer.Exit(error.exit_code) from None
-            except KeyboardInterrupt:
-                print("interrupted", file=sys.stderr)
-                raise typer.Exit(130) from None
+                with _sigterm_interrupts():
+                    function(*args, **kwargs)
+            except KeyboardInterrupt as stop:
+                stop = stop if isinstance(stop, Interrupted) else Interrupted("interrupted")
+                print(stop, file=sys.stderr)
+                raise typer.Exit(stop.exit_code) from None
+            except Exception as error:
+                known = known_error(error, name)
+                if known is None:
+                    raise
+                print(f"error: {known}", file=sys.stderr)
+                raise typer.Exit(known.exit_code) from None
 
         return guarded
 
     return register
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """SIGTERM (of ``kill``, a batch system, ``docker stop``) ends a command as Ctrl-C does: what is not finished is cleared away."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise Interrupted("terminated", number)
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
-from mmsynth.errors import InputError
+from mmsynth.errors import InputError, is_out_of_memory
 from mmsynth.field.design import Corrections, Design
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import Sampling
@@ -31,6 +31,7 @@ CORRECTIONS_FILE = "corrections.safetensors"  # what frames of these add
 def save_field(field: Field, run: Path) -> None:
     """Write ``field.safetensors`` and ``manifest.json`` into the run folder, of a field that predicts modalities also its prior, each
     atomically, the manifest last."""
+    (run / "manifest.json").unlink(missing_ok=True)  # it must not vouch for another field
     content = save({k: v.detach().cpu().contiguous() for k, v in field.state_dict().items()})
     write_atomic(run / "field.safetensors", lambda path: path.write_bytes(content))
     if field.prediction is not None:
@@ -94,6 +95,8 @@ def load_field(run: Path, device: str = "cpu") -> Field:
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: not the manifest of a fit of this version ({error}).") from error
     except (OSError, SafetensorError, RuntimeError) as error:
+        if is_out_of_memory(error):
+            raise
         raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
     field.manifest = manifest
     if device == "cpu":

@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 
-from mmsynth.errors import InputError
+from mmsynth.errors import InputError, is_out_of_memory
 from mmsynth.files import write_atomic
 
+CHECKPOINT_FOLDER = "checkpoint"  # of a run
 _NAME = "state.pt"
 
 
@@ -18,7 +19,7 @@ def write_checkpoint(run: Path, state: dict[str, Any]) -> None:
     """Replace the run's checkpoint. ``state`` holds tensors, numbers, strings and containers of them."""
     content = io.BytesIO()  # torch's own file writer answers a full disk with an internal error
     torch.save(state, content)
-    write_atomic(run / "checkpoint" / _NAME, lambda path: path.write_bytes(content.getbuffer()))
+    write_atomic(run / CHECKPOINT_FOLDER / _NAME, lambda path: path.write_bytes(content.getbuffer()))
 
 
 def read_checkpoint(run: Path) -> dict[str, Any] | None:
@@ -27,10 +28,12 @@ def read_checkpoint(run: Path) -> dict[str, Any] | None:
     Raises:
         InputError: the file is broken.
     """
-    path = run / "checkpoint" / _NAME
+    path = run / CHECKPOINT_FOLDER / _NAME
     if not path.is_file():
         return None
     try:
         return torch.load(path, weights_only=True)
     except Exception as error:  # torch raises many kinds for a broken archive
+        if is_out_of_memory(error):
+            raise
         raise InputError(f"{path}: not a readable checkpoint ({str(error).splitlines()[0]}).") from error

@@ -22,7 +22,7 @@ class Adam:
     """
 
     def __init__(self, parameters: dict[str, nn.Parameter], rates: dict[str, float], sparse: Collection[str] = ()) -> None:
-        self.parameters, self.rates, self.sparse = parameters, rates, sparse
+        self.parameters, self.rates, self.sparse = dict(parameters), rates, sparse
         self.moments = {n: [torch.zeros_like(p), torch.zeros_like(p)] for n, p in parameters.items()}
         self.count = 0
 
@@ -48,6 +48,10 @@ class Adam:
         """Follow a parameter that has new rows behind its first ``kept``."""
         self.moments[name] = [torch.cat([m[:kept], torch.zeros_like(self.parameters[name][kept:])]) for m in self.moments[name]]
 
+    def forget(self, name: str) -> None:
+        """Leave out a parameter that the field does not have any more."""
+        del self.parameters[name], self.moments[name]
+
     def clear(self) -> None:
         """Drop the gradients without a step."""
         for parameter in self.parameters.values():
@@ -68,7 +72,7 @@ class Average:
     """Exponential mean of named parameters (Polyak and Juditsky 1992): the noise of single batches averages out."""
 
     def __init__(self, parameters: dict[str, nn.Parameter]) -> None:
-        self.parameters = parameters
+        self.parameters = dict(parameters)
         self.means: dict[str, torch.Tensor] = {}
         self.count = 0
 
@@ -87,6 +91,11 @@ class Average:
         """Follow a parameter that has new rows behind its first ``kept``."""
         if name in self.means:
             self.means[name] = torch.cat([self.means[name][:kept], self.parameters[name][kept:]])
+
+    def forget(self, name: str) -> None:
+        """Leave out a parameter that the field does not have any more."""
+        del self.parameters[name]
+        self.means.pop(name, None)
 
     @torch.no_grad()
     def apply(self) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 import platform
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,19 @@ from typing import Any
 import numpy as np
 import torch
 
+from mmsynth.errors import Interrupted, OutOfMemoryError, known_error
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.samples import learn_from_frames, sample_field
 from mmsynth.field.storage import save_field
 from mmsynth.field.warmup import warm_up
-from mmsynth.files import write_text
-from mmsynth.fitting.checkpoint import read_checkpoint, write_checkpoint
+from mmsynth.files import remove_leftovers, write_text
+from mmsynth.fitting.checkpoint import CHECKPOINT_FOLDER, read_checkpoint, write_checkpoint
 from mmsynth.fitting.choices import switch
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import sampling_at
+from mmsynth.fitting.signals import delayed_signals
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.prior.prediction import common, predict, scene_facts
@@ -35,7 +37,7 @@ from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.scene.serialisation import CONVENTIONS, source_to_json
 from mmsynth.version import __version__
 
-CHECKPOINT_SECONDS = 60.0
+CHECKPOINT_EVERY = 60.0  # seconds
 _BUDGET = 60.0  # seconds, of a fit that is given no length
 _LOG_SECONDS = 1.0
 _UNSEEN_ERROR = 1.5  # of a view that was not learned from, over that of those that were: 1.0 after a minute, 1.6 after five
@@ -54,6 +56,7 @@ def fit(
     prior: Prior | None = None,
     exposure: Exposure | None = None,
     on_load: OnLoad | None = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
     on_field: Callable[[Field], None] | None = None,
@@ -67,12 +70,15 @@ def fit(
         device: cpu or cuda. resume: go on from the run's checkpoint, if it has one.
         prior: to predict modalities that the scene lacks. exposure: of the scene; None: what it states.
         on_load: called as frames are read, with how many were and how many there are.
+        checkpoint_every: seconds.
         on_start: called once with what the scene was found to need. on_step: called after every step. on_field: called then with the field
             as it is, which it may render.
     Raises:
         InputError: the scene or recipe cannot be read, the run folder cannot be written, a checkpoint does not fit, or the prior has no
             channels in common with the scene.
         DivergedError: loss or gradients stopped to be finite; the checkpoint is kept.
+        OutOfMemoryError: the fit can go on from the last checkpoint where there is more.
+        Interrupted: by Ctrl-C or SIGTERM, after a checkpoint at the end of the step; a second one does not wait for it.
     """
     saved = read_checkpoint(run) if resume else None
     if steps is None and budget is None:
@@ -89,6 +95,8 @@ def fit(
     taught = scene if prior is None else _without_sparse(scene, prior, recipe)
     trainer = Trainer(taught, recipe, steps, budget, seed, device, on_load)
     log: list[str] = []
+    for folder in (run, run / CHECKPOINT_FOLDER):
+        remove_leftovers(folder)
     if saved is not None:
         trainer.restore(saved)
         if (run / "train.jsonl").is_file():
@@ -98,15 +106,32 @@ def fit(
         write_checkpoint(run, trainer.checkpoint())
     if on_start is not None:
         on_start(trainer.needs)
+    with _going_on_later(run), delayed_signals() as stop:
+        _learn(trainer, run, log, checkpoint_every, stop, on_step, on_field)
+        if stop:
+            raise Interrupted(f"fit: stopped at step {trainer.state.step}; --resume goes on from there in {run}.", stop[0])
+    field = _finished(trainer)
+    field.manifest = _manifest(trainer, taught)
+    if prior is not None:
+        _predict(field, scene, prior, exposure)
+    save_field(field, run)
+    return field
+
+
+def _learn(
+    trainer: Trainer,
+    run: Path,
+    log: list[str],
+    checkpoint_every: float,
+    stop: Collection[int],
+    on_step: Callable[[FitProgress], None] | None,
+    on_field: Callable[[Field], None] | None,
+) -> None:
+    """Steps until the fit is done, or ``stop`` has a signal; the last checkpoint is where they end."""
     began, before = time.perf_counter(), trainer.state.elapsed
     last_saved = last_logged = began
-    while trainer.progress < 1.0:
-        try:
-            trainer.run_step()
-        except KeyboardInterrupt:
-            # the step may be half applied: only the last checkpoint is safe to go on from
-            print(f"interrupted; go on with --resume from the checkpoint in {run}", file=sys.stderr)
-            raise
+    while trainer.progress < 1.0 and not stop:
+        trainer.run_step()
         now = time.perf_counter()
         trainer.state.elapsed = before + now - began
         if on_step is not None:
@@ -118,16 +143,27 @@ def fit(
             news = trainer.report()
             log.append(json.dumps({"step": news.step, "elapsed": round(news.elapsed, 3), "loss": news.loss, "psnr": news.psnr}))
             last_logged = now
-        if now - last_saved > CHECKPOINT_SECONDS:
+        if now - last_saved > checkpoint_every:
             _save(run, trainer, log)
             last_saved = time.perf_counter()
     _save(run, trainer, log)
-    field = _finished(trainer)
-    field.manifest = _manifest(trainer, taught)
-    if prior is not None:
-        _predict(field, scene, prior, exposure)
-    save_field(field, run)
-    return field
+
+
+@contextmanager
+def _going_on_later(run: Path) -> Iterator[None]:
+    """What ends a fit in the middle says how to go on. The step may be half applied: the last checkpoint is what is safe."""
+    try:
+        yield
+    except Interrupted:
+        raise
+    except KeyboardInterrupt as error:
+        raise Interrupted(f"fit: interrupted; --resume goes on from the last checkpoint in {run}.") from error
+    except (MemoryError, RuntimeError) as error:
+        known = known_error(error, "fit")
+        if not isinstance(known, OutOfMemoryError):
+            raise
+        sentence = str(known).rstrip(".")
+        raise OutOfMemoryError(f"{sentence}; --resume goes on from the last checkpoint in {run}.") from error
 
 
 def _predict(field: Field, scene: Scene, prior: Prior, exposure: Exposure) -> None:
@@ -167,8 +203,9 @@ def _without_sparse(scene: Scene, prior: Prior, recipe: Recipe) -> Scene:
 
 
 def _save(run: Path, trainer: Trainer, log: list[str]) -> None:
-    write_checkpoint(run, trainer.checkpoint())
+    # the log first: a fit that is killed in between drops the lines beyond its checkpoint, it could not make up for missing ones
     write_text(run / "train.jsonl", "".join(f"{line}\n" for line in log))
+    write_checkpoint(run, trainer.checkpoint())
 
 
 def _rendered_sampling(trainer: Trainer) -> Sampling:

@@ -376,7 +376,10 @@ class Trainer:
             self.average.resize(name, rows)
 
     def _mirror(self, light: Choice[bool]) -> None:
-        if not light.value:
+        if not light.value and self.field.light is not None:
+            for name, _ in self.field.light.named_parameters(prefix="light"):
+                self.optimiser.forget(name)
+                self.average.forget(name)
             self.field.light = None
             self.field.design = replace(self.field.design, light=False)
 

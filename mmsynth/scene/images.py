@@ -25,7 +25,7 @@ import numpy as np
 import OpenEXR
 import tifffile
 
-from mmsynth.errors import InputError
+from mmsynth.errors import InputError, is_out_of_memory
 from mmsynth.scene.scene import Frame, Sensor
 
 _GREY = 12 / 255  # spread of the channels of a grey picture: lossy WebP leaves up to 9 codes
@@ -77,6 +77,8 @@ def read_native(path: Path) -> np.ndarray:
     except InputError:
         raise
     except Exception as error:  # each library has its own zoo of exceptions for a damaged file
+        if is_out_of_memory(error):
+            raise
         raise InputError(f"{path}: damaged or truncated image, could not be read ({first_line(error)}).") from error
     if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
         raise InputError(f"{path}: pixels of type {image.dtype}, expected uint8, uint16 or float.")
@@ -91,6 +93,8 @@ def read_npz(file: Path | IO[bytes], name: Path | str = "") -> dict[str, np.ndar
         with np.load(file) as arrays:
             return {key: arrays[key] for key in arrays.files}
     except Exception as error:  # zipfile, zlib and numpy each have their own
+        if is_out_of_memory(error):
+            raise
         raise InputError(f"{name or file}: damaged or missing, could not be read ({first_line(error)}).") from error
 
 
@@ -270,6 +274,8 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
             file = OpenEXR.File(str(path), separate_channels=True)
         return {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:
+        if is_out_of_memory(error):
+            raise
         raise InputError(f"{path}: damaged or truncated image, could not be read ({first_line(error)}).") from error
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from mmsynth.field.field import Field
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.run import fit
+from mmsynth.fitting.run import CHECKPOINT_EVERY, fit
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
@@ -35,6 +35,7 @@ def fit_run(
     prior: Prior | None = None,
     exposure: Exposure | None = None,
     on_load: OnLoad | None = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
     on_field: Callable[[Path, Field], None] | None = None,
@@ -45,7 +46,7 @@ def fit_run(
         folder: None: a new one in ``runs``, or with ``resume`` the scene's run whose checkpoint is the newest. The others: see ``fit``;
             on_field is given the folder, too.
     Raises:
-        InputError: as ``fit``, or there is nothing to resume.
+        InputError: as ``fit``, or there is nothing to resume. Others: as ``fit``.
     """
     name = scene.root.resolve().name
     folder = folder or (run_to_resume(name) if resume else new_run(name))
@@ -61,6 +62,7 @@ def fit_run(
         prior=prior,
         exposure=exposure,
         on_load=on_load,
+        checkpoint_every=checkpoint_every,
         on_start=on_start,
         on_step=on_step,
         on_field=None if on_field is None else functools.partial(on_field, folder),

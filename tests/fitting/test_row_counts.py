@@ -13,7 +13,6 @@ from mmsynth.field.design import Design
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
-from mmsynth.fitting import run as run_module
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
@@ -155,19 +154,16 @@ def test_no_counting_gives_the_most_from_the_start(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("killed_at", [3, 9])
-def test_a_fit_killed_before_or_after_the_count_becomes_the_same(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
-) -> None:
+def test_a_fit_killed_before_or_after_the_count_becomes_the_same(scene: Scene, tmp_path: Path, killed_at: int) -> None:
     recipe = Recipe().with_changes(SMALL)
     whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=16)
-    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
 
     def kill(news: FitProgress) -> None:
         if news.step == killed_at:
             raise RuntimeError("killed")
 
     with pytest.raises(RuntimeError, match="killed"):
-        fit(scene, tmp_path / "cut", recipe=recipe, steps=16, on_step=kill)
+        fit(scene, tmp_path / "cut", recipe=recipe, steps=16, checkpoint_every=0.0, on_step=kill)
     resumed = fit(scene, tmp_path / "cut", recipe=recipe, resume=True)
     assert resumed.design == whole.design and resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
     for name, value in whole.state_dict().items():

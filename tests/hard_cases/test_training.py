@@ -15,7 +15,6 @@ from usual import nerfacc_keeps, neus_weights
 from mmsynth.errors import DivergedError
 from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, odds, reference
 from mmsynth.field.rendering import ball_interval
-from mmsynth.fitting import run as run_module
 from mmsynth.fitting.measurements import draw
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -127,11 +126,10 @@ def _resumed_from_parameters(scene: Scene, recipe: Recipe, at: int) -> float:
     return float((whole.field.surface(points, 3) - resumed.field.surface(points, 3)).detach().abs().mean())
 
 
-def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_path: Path) -> None:
     """Killed where levels open, tables are sized, directions are decided."""
     recipe = QUICK.with_changes({"poses.views": "on"})
     whole = fit(scene, tmp_path / "whole", recipe=recipe, steps=40)
-    monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
     for at in (1, 3, 13, 25, 39):
 
         def kill(news: FitProgress, at: int = at) -> None:
@@ -139,7 +137,7 @@ def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_
                 raise RuntimeError("killed")
 
         with pytest.raises(RuntimeError, match="killed"):
-            fit(scene, tmp_path / f"cut{at}", recipe=recipe, steps=40, on_step=kill)
+            fit(scene, tmp_path / f"cut{at}", recipe=recipe, steps=40, checkpoint_every=0.0, on_step=kill)
         resumed = fit(scene, tmp_path / f"cut{at}", recipe=recipe, resume=True)
         assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True)), at
     off = _resumed_from_parameters(scene, QUICK.with_changes({"schedule.tables_at": 0, "radiance.light": "off"}), 25)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -93,6 +94,7 @@ def video_steps(
     exposures, depths = _of_the_path(field, views, displays, colours)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     writer = None
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it warns of each picture that did not reach the disk
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for index, view in enumerate(views):
@@ -107,6 +109,8 @@ def video_steps(
             yield index + 1, len(views)
         if writer is not None:
             writer.release()
+        if not _is_whole(temporary):  # OpenCV reports no failure
+            raise InputError(f"{path}: could not be written (it is cut off: the disk may be full).")
         os.replace(temporary, path)
     except OSError as error:
         raise InputError(f"{path}: could not be written ({error.strerror or error}).") from error
@@ -114,6 +118,19 @@ def video_steps(
         if writer is not None:
             writer.release()
         temporary.unlink(missing_ok=True)
+        cv2.utils.logging.setLogLevel(level)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether an mp4 file has all of its boxes, each of which begins with its size (ISO 14496-12); its index is written last."""
+    end, at, names = path.stat().st_size, 0, set()
+    with open(path, "rb") as stream:
+        while at + 16 <= end:
+            stream.seek(at)
+            size, name, long_size = struct.unpack(">I4sQ", stream.read(16))
+            names.add(name)
+            at += long_size if size == 1 else max(size, 8)
+    return at == end and b"moov" in names
 
 
 def _of_the_path(

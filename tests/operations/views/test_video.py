@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import cv2
@@ -54,6 +55,18 @@ def test_one_that_is_given_up_leaves_nothing(tmp_path: Path) -> None:
     next(steps)
     steps.close()  # type: ignore[attr-defined]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_fills_up_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The kernel refuses to let the file grow, as a full disk would; OpenCV says nothing of it to its caller."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(InputError, match=r"a\.mp4: could not be written \(it is cut off: the disk may be full\)"):
+            list(video_steps(FIELD, VIEWS, [find_display(FIELD, "rgb")], tmp_path / "a.mp4"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir()) and not capfd.readouterr().err
 
 
 def test_what_cannot_be_filmed_is_said(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, optimiser, shading, surface, tracing_gradients
@@ -20,6 +21,7 @@ def is_compiled() -> bool:
 
 
 def _cached(kernel: Any) -> bool:
-    # numba writes one index file per function and source version; it is missing exactly when the kernel was never compiled
+    # one index file per function and source version; a process that is killed leaves an index without the code that it lists, or none
     cache = kernel._cache._cache_file
-    return bool(cache.load_index() if hasattr(cache, "load_index") else cache._load_index())
+    listed = (cache.load_index() if hasattr(cache, "load_index") else cache._load_index()).values()
+    return bool(listed) and all((Path(cache._cache_path) / name).is_file() for name in listed)

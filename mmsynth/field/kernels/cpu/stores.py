@@ -98,7 +98,7 @@ class Store(Generic[S]):
         self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes.items()})
 
     def __del__(self) -> None:
-        if len(_pool) < _POOLED:
+        if len(_pool) < _POOLED and hasattr(self, "arrays"):  # none where memory lacked for them
             _pool.append((self.key, self.arrays))
 
 
