@@ -26,7 +26,7 @@ from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import blocked_weight, learning_rate_factor, light_looks, sampling_at, surface_rate_factor
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
@@ -145,6 +145,7 @@ class Trainer:
         if self.has_empty:
             opacity, more = self._opacity_outside(random, sampling, generator)
             loss, samples = loss + self.recipe.loss.alpha_weight * opacity.square().mean(), samples + more
+            loss = loss + blocked_weight(self.progress, self.recipe) * losses.blocked(opacity, sampling.max_optical_depth).mean()
         wrong = self._differentiate(loss)
         if wrong is not None:
             self._skip(wrong)
@@ -253,6 +254,8 @@ class Trainer:
             known = torch.isfinite(batch.alpha)
             off = batch.ray_weight * (hits.opacity - batch.alpha).square()
             loss = loss + recipe.loss.alpha_weight * off[known].sum() / len(jitter)
+            blocked = batch.ray_weight * losses.blocked(hits.opacity, sampling.max_optical_depth) * (batch.alpha == 0.0)
+            loss = loss + blocked_weight(self.progress, recipe) * blocked.mean()
         elif self.needs.black_background:
             m = batch.measured
             black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02

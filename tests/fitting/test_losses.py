@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mmsynth.field.kernels import Measured, photometric, predict, residual
-from mmsynth.fitting.losses import eikonal
+from mmsynth.fitting.losses import blocked, eikonal
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Sensor
@@ -235,6 +235,18 @@ def test_eikonal_is_zero_for_distances_alone() -> None:
     assert float(eikonal(torch.tensor([[3.0, 0.0, 4.0], [0.0, 1.0, 0.0]]))) == pytest.approx(8.0)
     slopes = torch.tensor([[0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 1.5, 0.0]])
     assert float(eikonal(slopes, torch.tensor([0.1, 1.0, 0.1]))) == pytest.approx((0.1 + 1.0 + 1.0) / 3 * 0.25)
+
+
+def test_what_is_solid_is_pulled_as_much_as_what_is_half_open() -> None:
+    """d/dτ of the loss at opacity 1 - e^-τ: 1 as long as 1 - opacity is well above what is left where rays end."""
+    depth = torch.tensor([0.1, 0.6, 0.8, 2.0, 6.0, 9.0], dtype=torch.float64, requires_grad=True)
+    loss = blocked(1.0 - torch.exp(-depth), max_optical_depth=20.0)
+    (pull,) = torch.autograd.grad(loss.sum(), depth)
+    np.testing.assert_allclose(pull, [0, 0, 1, 1, 1, 1], atol=1e-4)  # opacity 0.45 at 0.6
+    np.testing.assert_allclose(loss.detach()[2:], depth.detach()[2:], atol=1e-4)
+    ended = torch.ones(1, requires_grad=True)  # what is left of a ray that ended is given to its last section
+    (pull,) = torch.autograd.grad(blocked(ended, max_optical_depth=3.0).sum(), ended)
+    assert float(blocked(ended, 3.0)) == pytest.approx(3.0) and float(pull) == pytest.approx(np.exp(3.0))
 
 
 def test_integers_stay_integers_in_memory(tmp_path: Path) -> None:
