@@ -54,7 +54,7 @@ def run_kernels() -> None:
         rays_of_step = kernels.Rays(origins.detach(), directions, one, 3.0 * one, one - 1.0)
         kernels.learn(
             *surface.at(1), appearance.at(1), Occupancy(4).states, weights, light.network(), none, rays_of_step,
-            kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none),
+            kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none, none, 0.05),
             kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
         )  # fmt: skip
     with torch.no_grad():

@@ -9,6 +9,7 @@ All parameters but the tables lie in one array, with their gradients and moments
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -142,8 +143,8 @@ class DeviceStep:
     def _flatten(self) -> tuple[_Flat, dict[str, int]]:
         """Lay the small parameters one after the other, the shader's first, in the order that ``learn_all`` sums; where each begins."""
         shader, light = list(self.field.shader.parameters()), self.field.light
-        first = [*shader, *([] if self.field.far_light is None else [self.field.far_light])]
-        first += [] if light is None else [*light.network()[:6]]
+        first: list[Tensor] = [*shader, *([] if self.field.far_light is None else [self.field.far_light])]
+        first += [] if light is None else list(light.network()[:6])
         place = {id(p): i for i, p in enumerate(first)}
         names = [n for n in self.adam.parameters if n not in _TABLES]
         names.sort(key=lambda n: place.get(id(self.adam.parameters[n]), len(place)))
@@ -154,7 +155,8 @@ class DeviceStep:
         rates = [torch.full((size,), self.adam.rates[n], device=self.field.device) for n, size in zip(names, sizes, strict=True)]
         kinds = [torch.full_like(rate, n.startswith("surface."), dtype=torch.uint8) for n, rate in zip(names, rates, strict=True)]
         values = join(parts)
-        flat = _Flat(values, torch.zeros_like(values), *map(join, moments), torch.cat(rates), torch.cat(kinds))
+        first_moment, second_moment = map(join, moments)
+        flat = _Flat(values, torch.zeros_like(values), first_moment, second_moment, torch.cat(rates), torch.cat(kinds))
         begins, begin = {}, 0
         for name, p, size in zip(names, parts, sizes, strict=True):
             own = [x[begin : begin + size].view(p.shape) for x in flat[:4]]
@@ -215,8 +217,10 @@ class DeviceStep:
         sizes = [(b[0][-1], b[1][-1], b[2][-1], max(counts)) for b, counts in zip(begins, (stage.rays, stage.outside), strict=True)]
         rays, outside = sizes[0][0], sizes[1][0]
         has_opacity = any(x.has_opacity for x in m.values())
+        solid = 0.0 if stage.early else loss.blocked_weight
         known = stepping.Known(
             loss.alpha_weight / rays, loss.alpha_weight / max(outside, 1), loss.background_opacity_weight / rays,
+            solid / rays, solid / max(outside, 1), math.exp(-sampling.max_optical_depth),
             has_opacity or self.needs.black_background, self.needs.black_background and not has_opacity,
         )  # fmt: skip
         bounds, contracted = (rendering.NEAR, rendering.FREE, rendering.FARTHEST), grid.extent > 1.0
@@ -228,7 +232,7 @@ class DeviceStep:
         surface, appearance = field.surface.at(stage.active[0]), field.appearance.at(stage.active[1])
         none = torch.empty(0, device=device)
         shader = field.shader.weights()
-        network = kernels.LightNetwork(*[none] * 6, ints([], torch.int64))
+        network = kernels.LightNetwork(none, none, none, none, none, none, ints([], torch.int64))
         if field.light is not None and stage.lamps:
             network = field.light.network()._replace(used=ints(stage.lamps, torch.int64))
         far_light = field.far_light if stage.far_light and field.far_light is not None else none
@@ -276,8 +280,9 @@ class DeviceStep:
 
     def _tell(self) -> None:
         """Send what the device tells on its way; the host is never more than ``_AHEAD`` times that far ahead of it."""
-        while len(self.copies) > _AHEAD and self.copies[0][1] is not None:
-            self.copies.pop(0)[1].synchronize()
+        while len(self.copies) > _AHEAD and (event := self.copies[0][1]) is not None:
+            event.synchronize()
+            self.copies.pop(0)
         if self.told.device.type == "cpu":
             self.copies.append((self.told.clone(), None))
             return

@@ -336,7 +336,8 @@ def _with_levels(measurements: Measurements) -> Measurements:
 def _on(measurements: Measurements, device: torch.device | str) -> Measurements:
     m, f = measurements, measurements.frames
     buffer = f.codes8.to(device)  # once: the others are views of it
-    frames = kernels.Frames(*(x.to(device) for x in f[:-3]), buffer, buffer.view(torch.uint16), buffer.view(torch.float32))
+    views = {"codes8": buffer, "codes16": buffer.view(torch.uint16), "floats": buffer.view(torch.float32)}
+    frames = _moved(f._replace(**views), device)
     return Measurements(
         m.of, m.order, frames, _moved(m.cameras, device), _moved(m.modalities, device), _moved(m.chosen, device),
         None if m.empty is None else _moved(m.empty, device),

@@ -161,6 +161,12 @@ class LossRecipe(_Section):
     alpha_weight: float = _key(
         0.5, "Weight of the squared difference of opacity and alpha, where images have it or masks of an object say it [1].", ge=0
     )
+    blocked_weight: float = _key(
+        0.2,
+        "Weight of the optical depth of rays that are mostly blocked where alpha or masks of an object say that nothing is [1], once "
+        "all levels are active: opens what has become solid there.",
+        ge=0,
+    )
 
 
 class Recipe(_Section):

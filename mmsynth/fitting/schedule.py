@@ -49,6 +49,11 @@ def learning_rate_factor(progress: float, recipe: Recipe) -> float:
     return max(rise, 0.02) * math.exp(math.log(recipe.schedule.learning_rate_end_factor) * fall)
 
 
+def blocked_weight(progress: float, recipe: Recipe) -> float:
+    """None until all levels are active: till then soft surfaces block rays that pass by, and what is pulled away there is the object."""
+    return 0.0 if progress < recipe.schedule.levels_until else recipe.loss.blocked_weight
+
+
 _LOOKS = 3  # before it is decided whether lamps are needed
 
 

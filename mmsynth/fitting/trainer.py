@@ -27,7 +27,7 @@ from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import blocked_weight, learning_rate_factor, light_looks, sampling_at, surface_rate_factor
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
@@ -314,18 +314,21 @@ class Trainer:
         """What is known of the opacity of a batch's rays, and that so many rays behind them meet nothing."""
         recipe, rays, none = self.recipe.loss, len(batch.origins), batch.ray_weight.new_zeros
         if not (self.has_opacity or self.needs.black_background):
-            return kernels.Opacities(none(0), none(0), none(0))
-        target, weight, linear = none(rays + outside), none(rays + outside), none(rays + outside)
+            return kernels.Opacities(none(0), none(0), none(0), none(0), 0.0)
+        target, weight, linear, blocked = (none(rays + outside) for _ in range(4))
         weight[rays:] = recipe.alpha_weight / max(outside, 1)
+        solid = blocked_weight(self.progress, self.recipe)
+        blocked[rays:] = solid / max(outside, 1)
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)
             target[:rays] = torch.where(known, batch.alpha, target[:rays])
             weight[:rays] = recipe.alpha_weight / rays * batch.ray_weight * known
+            blocked[:rays] = solid / rays * batch.ray_weight * (batch.alpha == 0.0)
         else:
             m = batch.measured
             black = none(rays).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
             linear[:rays] = recipe.background_opacity_weight / rays * batch.ray_weight * black
-        return kernels.Opacities(target, weight, linear)
+        return kernels.Opacities(target, weight, linear, blocked, math.exp(-self.recipe.sampling.max_optical_depth))
 
     def _eikonal(self, rays: int, sampling: kernels.Sampling, generator: torch.Generator) -> kernels.Eikonal:
         """Where the distance is pulled towards a true one: a quarter of the points in all space, the others within the soft surface, or at

@@ -66,7 +66,7 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
         "view": kernels.View(torch.randint(4, (count,)), torch.rand(count) > 0.3 if sparse else torch.ones(count, dtype=torch.bool)),
         "measured": measured,
         "gains": kernels.Gains(frames, torch.randint(5, (numbers,))),
-        "opacities": kernels.Opacities(*(torch.rand(3, count) / count if opacities else torch.empty(3, 0))),
+        "opacities": kernels.Opacities(*(torch.rand(4, count) / count if opacities else torch.empty(4, 0)), 0.05),
         "eikonal": kernels.Eikonal(
             (torch.rand(100, 3) * 2 - 1) * extent, torch.empty(0, 3) if lamps else 0.05 * torch.randn(120, 3), 0.1, 0.08, 0.16, 0.3
         ),

@@ -435,6 +435,23 @@ def test_alpha_asks_for_opacity(tmp_path: Path) -> None:
     )
 
 
+def test_what_is_solid_where_alpha_says_nothing_is_asked_to_open(tmp_path: Path) -> None:
+    """Once all levels are active, and not where the object is."""
+    trainer = _trainer(_ball_scene(tmp_path, transparent_disc))
+    batch = _batch(trainer, 400)
+    with torch.no_grad():  # all opaque
+        trainer.field.surface.output_weight[-1] = -0.6
+    opacity = _opacity(trainer, batch)
+    solid = (batch.alpha == 0) & (opacity > 0.5)
+    assert 50 < solid.sum() < 350
+    ask = lambda weight: _loss(trainer, batch, **{"loss.blocked_weight": weight, "loss.alpha_weight": 0.0, "loss.eikonal_weight": 0.0})
+    assert ask(0.7) == ask(0.0)
+    trainer.steps, trainer.state.step = 100, 40  # as far as levels_until of these tests
+    assert trainer.progress == SMALL.schedule.levels_until
+    depth = -torch.log(1.0 - opacity[solid] + np.exp(-SMALL.sampling.max_optical_depth))
+    assert ask(0.7) - ask(0.0) == pytest.approx(0.7 * float(depth.sum()) / 400, rel=1e-3)
+
+
 def test_an_object_on_black_is_found(tmp_path: Path) -> None:
     """A sphere of radius 0.6 or so, seen by every ray through the discs and by no other."""
     for picture in (disc, transparent_disc):

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import linear, normalize
 
 from mmsynth.field.kernels import reference
-from mmsynth.field.kernels.constants import LEAST_WEIGHT
+from mmsynth.field.kernels.constants import LEAST_WEIGHT, MOSTLY_BLOCKED
 from mmsynth.field.kernels.parameters import (
     Eikonal,
     Gains,
@@ -72,6 +72,8 @@ def learn(
     if len(opacities.target):
         o = opacities
         loss = loss + (o.weight * (hits.opacity - o.target).square() + o.linear * hits.opacity).sum()
+        depth = -torch.log(1.0 - hits.opacity + o.left)
+        loss = loss + torch.where(hits.opacity > MOSTLY_BLOCKED, o.blocked * depth, torch.zeros_like(depth)).sum()
     asked = len(eikonal.points) + (count if len(light.used) else len(eikonal.noise))
     off = torch.linalg.vector_norm(slopes, dim=-1) - 1.0
     loss = loss + eikonal.weight / max(asked, 1) * (torch.where(off < 0.0, shallow, 1.0) * off.square()).sum()

@@ -206,11 +206,22 @@ class Gains(NamedTuple):
 
 
 class Opacities(NamedTuple):
-    """What is known of the opacity o of R rays: Σ weight (o - target)² + linear o is part of the loss; (R,) each, or all empty."""
+    """What is known of the opacity o of R rays, (R,) each, or all empty: Σ weight (o - target)² + linear o + blocked b is part of the loss.
+
+    b = -log(1 - o + left) where o > ``MOSTLY_BLOCKED``, else 0: the optical depth τ, o = 1 - e^-τ,
+    of rays along which nothing should be. The
+    gradient of o, and of its square, is that of e^-τ: it leaves what has become solid as it is. This one is as strong at every depth; it
+    is the emptiness term of the binary cross entropy that NeuS has for masks (Wang et al. 2021, eq. 8).
+
+    Attributes:
+        left: share of the light that is left of a ray that was ended.
+    """
 
     target: Tensor
     weight: Tensor
     linear: Tensor
+    blocked: Tensor
+    left: float
 
 
 class Eikonal(NamedTuple):

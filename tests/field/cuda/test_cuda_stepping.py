@@ -36,7 +36,7 @@ def _drawn(device: str) -> tuple[kernels.Drawn, stepping.Tables, list[torch.Tens
 @pytest.mark.parametrize("black", [False, True])
 def test_what_is_known_of_rays(device: str, contracted: bool, black: bool) -> None:
     drawn, tables, ends = _drawn(device)
-    known = stepping.Known(0.3, 0.7, 0.2, True, black)
+    known = stepping.Known(0.3, 0.7, 0.2, 0.15, 0.4, 0.05, True, black)
     rays, view, opacities = stepping.aim(drawn, *ends, tables, known, BOUNDS, contracted)
     origins, directions = ends[:2]
     if contracted:
@@ -53,6 +53,8 @@ def test_what_is_known_of_rays(device: str, contracted: bool, black: bool) -> No
     weight = torch.zeros_like(drawn.alpha) if black else 0.3 * drawn.ray_weight * stated
     torch.testing.assert_close(opacities.weight, torch.cat([weight, weight.new_full((OUTSIDE,), 0.7)]))
     torch.testing.assert_close(opacities.target[:RAYS], torch.where(stated, drawn.alpha, 0.0))
+    nothing = torch.zeros_like(drawn.alpha) if black else 0.15 * drawn.ray_weight * (drawn.alpha == 0.0)
+    torch.testing.assert_close(opacities.blocked, torch.cat([nothing, nothing.new_full((OUTSIDE,), 0.4)]))
     m = drawn.measured
     dark = torch.zeros(RAYS, device=device).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
     torch.testing.assert_close(opacities.linear[:RAYS], 0.2 * drawn.ray_weight * dark * black)

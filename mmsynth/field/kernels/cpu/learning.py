@@ -6,12 +6,13 @@ and summed in the order of the chunks. The tables follow when all chunks are don
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
 from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, padded_output, scatter_block
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
@@ -25,6 +26,7 @@ from mmsynth.field.kernels.parameters import Rays, ShadedRays
 
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
+_MOSTLY_BLOCKED = _f(MOSTLY_BLOCKED)
 
 
 class TableStore(NamedTuple):
@@ -109,8 +111,13 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             off = opacity[i] - opacities.target[begin + i]
             w, along = opacities.weight[begin + i], opacities.linear[begin + i]
             loss += np.float64(w * off * off + along * opacity[i])
+            pull = _f(2.0) * w * off + along
+            if opacity[i] > _MOSTLY_BLOCKED:
+                passed = _ONE - opacity[i] + opacities.left
+                loss -= np.float64(opacities.blocked[begin + i] * math.log(passed))
+                pull += opacities.blocked[begin + i] / passed
             for which in range(2):
-                g_share[which * CHUNK + i] += _f(2.0) * w * off + along
+                g_share[which * CHUNK + i] += pull
     rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
     kept.turned_out[chunk], kept.output_out[chunk] = _ZERO, _ZERO
     n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.field.kernels.constants import HARMONICS
-from mmsynth.field.kernels.cuda.shared import HUBER, LEAST_WEIGHT, first_number, jit, softplus, sum_of_pair, tl, triton
+from mmsynth.field.kernels.cuda.shared import HUBER, LEAST_WEIGHT, MOSTLY_BLOCKED, first_number, jit, softplus, sum_of_pair, tl, triton
 from mmsynth.field.kernels.parameters import Measured, Opacities, ShadedRays, ShaderWeights
 
 RAYS = 32  # of a program: with more, or with its weights' gradients kept in registers over several times as many, registers spill
@@ -79,7 +79,7 @@ def compare_kernel(  # type: ignore[no-untyped-def]
     features, share, behind, directions, degrees, trains,
     target, ray, output, axes, level, saturation, weight, gain, mirrored,
     first, first_bias, second, second_bias, heads, heads_bias, far, opacity_target, opacity_weight, opacity_linear,
-    loss, squared, g_features, g_share, g_gain, g_mirrored, partial, stride,
+    opacity_blocked, opacity_left, loss, squared, g_features, g_share, g_gain, g_mirrored, partial, stride,
     rays, rows, count, bright, bisections,
     FEATURES: tl.constexpr, WIDTH: tl.constexpr, UNITS: tl.constexpr, LAYER: tl.constexpr, OUTPUTS: tl.constexpr, HEADS: tl.constexpr,
     FAR: tl.constexpr, OPACITY: tl.constexpr, POLARIZED: tl.constexpr, GAIN: tl.constexpr, MIRRORED: tl.constexpr, LEARN: tl.constexpr,
@@ -190,7 +190,11 @@ def compare_kernel(  # type: ignore[no-untyped-def]
         off = opacity - tl.load(opacity_target + r, mask=live, other=0.0)
         known = tl.load(opacity_weight + r, mask=live, other=0.0)
         linear = tl.load(opacity_linear + r, mask=live, other=0.0)
-        total += tl.where(live & nearest, known * off * off + linear * opacity, 0.0).to(tl.float64)
+        solid = live & (opacity > MOSTLY_BLOCKED)
+        blocked = tl.load(opacity_blocked + r, mask=solid, other=0.0)
+        passed_by = tl.where(solid, 1.0 - opacity + opacity_left, 1.0)
+        of_opacity = known * off * off + linear * opacity - blocked * tl.log(passed_by)
+        total += tl.where(live & nearest, of_opacity, 0.0).to(tl.float64)
     if LEARN:
         tl.store(of_heads_bias + o, tl.sum(g_raw, 0), mask=o < OUTPUTS)
         store_tile(of_heads, o, u, UNITS, product(tl.trans(g_raw), h2), OUTPUTS, UNITS)
@@ -212,7 +216,7 @@ def compare_kernel(  # type: ignore[no-untyped-def]
             of_share -= tl.where(shares > LEAST_WEIGHT, of_mixed * mixed, 0.0)
             of_share = tl.where(met, of_share - sum_of_pair(of_passed, RAYS), 0.0)
         if OPACITY:
-            of_share += tl.where(met, 2.0 * known * off + linear, 0.0)
+            of_share += tl.where(met, 2.0 * known * off + linear + blocked / passed_by, 0.0)
         written = live & (row < rows)  # zeros, too, for what is not met but has a row
         tl.store(g_features + row[:, None] * FEATURES + f[None, :], gx, mask=written[:, None] & (f < FEATURES)[None, :])
         tl.store(g_share + row, of_share, mask=written)
@@ -258,7 +262,7 @@ def compare_all(
     """
     device, count, none = rays.features.device, len(rays.behind), rays.share
     far_light = none[:0] if far_light is None else far_light
-    opacities = Opacities(none[:0], none[:0], none[:0]) if opacities is None else opacities
+    opacities = Opacities(none[:0], none[:0], none[:0], none[:0], 0.0) if opacities is None else opacities
     programs, sizes = programs_of(count), [w.numel() for w in (*weights, far_light)]
     units, inputs = weights.first.shape
     outputs, features = len(weights.heads), inputs - HARMONICS

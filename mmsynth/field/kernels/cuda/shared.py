@@ -45,7 +45,7 @@ MAX_SAMPLES = constant(constants.MAX_SAMPLES_PER_RAY)
 LEAST_WEIGHT = constant(constants.LEAST_WEIGHT)
 FIRST_FEATURE_ROW = constant(constants.FIRST_FEATURE_ROW)
 HASH_Y, HASH_Z = constant(constants.HASH_PRIMES[1]), constant(constants.HASH_PRIMES[2])
-HUBER = constant(constants.HUBER_DELTA)
+HUBER, MOSTLY_BLOCKED = constant(constants.HUBER_DELTA), constant(constants.MOSTLY_BLOCKED)
 COLUMNS = constant(16)  # features that are looked up together, the least depth of a matrix product on tensor cores
 
 

@@ -57,7 +57,8 @@ def set_numbers(numbers: Numbers, sharpness: float, step: float, factor: float, 
 def aim_kernel(  # type: ignore[no-untyped-def]
     origins, directions, alpha, ray_weight, target, level, begins, values_of, degrees_of, trains_of,
     near, far, degrees, trains, opacity_target, opacity_weight, opacity_linear,
-    count, rays, modalities, alpha_weight, outside_weight, black_weight, closest, free, farthest, black,
+    opacity_blocked, count, rays, modalities, alpha_weight, outside_weight, black_weight, blocked_weight, blocked_outside, closest, free,
+    farthest, black,
     CONTRACTED: tl.constexpr, OPACITY: tl.constexpr, BLACK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """count: rays; those from ``rays`` on were drawn where nothing is."""
@@ -89,7 +90,9 @@ def aim_kernel(  # type: ignore[no-untyped-def]
         tl.store(opacity_target + i, tl.where(known, own, 0.0), mask=live)
         weight = tl.where(inside, tl.where(known, alpha_weight * w, 0.0), outside_weight)
         linear = 0.0 * w
+        blocked = tl.where(inside, tl.where(own == 0.0, blocked_weight * w, 0.0), blocked_outside)
         if BLACK:
+            blocked = tl.where(inside, 0.0, blocked_outside)
             weight = tl.where(inside, 0.0, outside_weight)
             values = tl.load(values_of + n, mask=live, other=0)
             first = tl.load(begins + modalities + 1 + n, mask=live, other=0) + (i - tl.load(begins + n, mask=live, other=0)) * values
@@ -101,6 +104,7 @@ def aim_kernel(  # type: ignore[no-untyped-def]
             linear = tl.where(inside & (tl.maximum(brightest, 0.0) < black), black_weight * w, 0.0)
         tl.store(opacity_weight + i, weight, mask=live)
         tl.store(opacity_linear + i, linear, mask=live)
+        tl.store(opacity_blocked + i, blocked, mask=live)
 
 
 class Tables(NamedTuple):
@@ -114,12 +118,15 @@ class Tables(NamedTuple):
 
 
 class Known(NamedTuple):
-    """Weights of what is known of opacity, see ``Opacities``: of alpha, of rays where nothing is, of opacity on black pixels. any: whether
-    anything is; black: whether it is black pixels."""
+    """Weights of what is known of opacity, see ``Opacities``: of alpha, of rays where nothing is, of opacity on black pixels; of what
+    blocks rays of alpha 0, and rays where nothing is. left: see there. any: whether anything is; black: whether it is black pixels."""
 
     alpha: float
     outside: float
     linear: float
+    blocked: float
+    blocked_outside: float
+    left: float
     any: bool
     black: bool
 
@@ -137,13 +144,14 @@ def aim(
     count, rays = len(origins), len(drawn.alpha)
     new = lambda *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype, device=origins.device)
     near, far, degrees, trains = new(count), new(count), new(count, dtype=torch.int64), new(count, dtype=torch.bool)
-    opacities = Opacities(*(new(count if known.any else 0) for _ in range(3)))
+    some = count if known.any else 0
+    opacities = Opacities(new(some), new(some), new(some), new(some), known.left)
     m = drawn.measured
     with torch.cuda.device_of(origins):
         aim_kernel[(triton.cdiv(count, BLOCK),)](
             origins, directions, drawn.alpha, drawn.ray_weight, m.target, m.level,
-            tables.begins, tables.values, tables.degrees, tables.trains, near, far, degrees, trains, *opacities,
-            count, rays, len(tables.values), *known[:3], *bounds, _BLACK, contracted, known.any, known.black, BLOCK,
+            tables.begins, tables.values, tables.degrees, tables.trains, near, far, degrees, trains, *opacities[:4],
+            count, rays, len(tables.values), *known[:5], *bounds, _BLACK, contracted, known.any, known.black, BLOCK,
         )  # fmt: skip
     return Rays(origins, directions, near, far, jitter), View(degrees, trains), opacities
 
