@@ -47,13 +47,8 @@ def test_availability_has_a_reason_of_one_line(monkeypatch: pytest.MonkeyPatch) 
     can, why = cuda.available()
     assert can is (why == "") and "\n" not in why
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(shared, "triton", type("triton", (), {"__version__": "3.6.0"}))
+    monkeypatch.setattr(shared, "triton", object())
     assert cuda.available() == (False, "torch sees no CUDA device")
-
-
-def test_a_version_of_triton_that_is_too_new_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "triton", type("triton", (), {"__version__": "3.9.0+git1"}))
-    assert cuda.available() == (False, "triton 3.9.0+git1 is not supported, install triton 3.6.0")
 
 
 def test_a_broken_toolchain_is_a_reason_not_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
