@@ -142,8 +142,8 @@ class DeviceStep:
     def _flatten(self) -> tuple[_Flat, dict[str, int]]:
         """Lay the small parameters one after the other, the shader's first, in the order that ``learn_all`` sums; where each begins."""
         shader, light = list(self.field.shader.parameters()), self.field.light
-        first = [*shader, *([] if self.field.far_light is None else [self.field.far_light])]
-        first += [] if light is None else [*light.network()[:6]]
+        first: list[Tensor] = [*shader, *([] if self.field.far_light is None else [self.field.far_light])]
+        first += [] if light is None else light.network()[:6]
         place = {id(p): i for i, p in enumerate(first)}
         names = [n for n in self.adam.parameters if n not in _TABLES]
         names.sort(key=lambda n: place.get(id(self.adam.parameters[n]), len(place)))
@@ -154,7 +154,7 @@ class DeviceStep:
         rates = [torch.full((size,), self.adam.rates[n], device=self.field.device) for n, size in zip(names, sizes, strict=True)]
         kinds = [torch.full_like(rate, n.startswith("surface."), dtype=torch.uint8) for n, rate in zip(names, rates, strict=True)]
         values = join(parts)
-        flat = _Flat(values, torch.zeros_like(values), *map(join, moments), torch.cat(rates), torch.cat(kinds))
+        flat = _Flat(values, torch.zeros_like(values), join(moments[0]), join(moments[1]), torch.cat(rates), torch.cat(kinds))
         begins, begin = {}, 0
         for name, p, size in zip(names, parts, sizes, strict=True):
             own = [x[begin : begin + size].view(p.shape) for x in flat[:4]]
@@ -228,7 +228,7 @@ class DeviceStep:
         surface, appearance = field.surface.at(stage.active[0]), field.appearance.at(stage.active[1])
         none = torch.empty(0, device=device)
         shader = field.shader.weights()
-        network = kernels.LightNetwork(*[none] * 6, ints([], torch.int64))
+        network = kernels.LightNetwork(none, none, none, none, none, none, ints([], torch.int64))
         if field.light is not None and stage.lamps:
             network = field.light.network()._replace(used=ints(stage.lamps, torch.int64))
         far_light = field.far_light if stage.far_light and field.far_light is not None else none
@@ -276,8 +276,8 @@ class DeviceStep:
 
     def _tell(self) -> None:
         """Send what the device tells on its way; the host is never more than ``_AHEAD`` times that far ahead of it."""
-        while len(self.copies) > _AHEAD and self.copies[0][1] is not None:
-            self.copies.pop(0)[1].synchronize()
+        if len(self.copies) > _AHEAD and (oldest := self.copies[0][1]) is not None:
+            oldest.synchronize()
         if self.told.device.type == "cpu":
             self.copies.append((self.told.clone(), None))
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -331,12 +331,13 @@ def _with_levels(measurements: Measurements) -> Measurements:
 
 
 def _on(measurements: Measurements, device: torch.device | str) -> Measurements:
-    move = lambda table: None if table is None else type(table)(*(x.to(device) for x in table))
-    tables = {f.name: move(getattr(measurements, f.name)) for f in fields(measurements) if f.name not in ("of", "order", "frames")}
-    f = measurements.frames
-    buffer = f.codes8.to(device)  # once: the others are views of it
-    frames = kernels.Frames(*(x.to(device) for x in f[:-3]), buffer, buffer.view(torch.uint16), buffer.view(torch.float32))
-    return replace(measurements, frames=frames, **tables)
+    move = lambda table: type(table)(*(x.to(device) for x in table))
+    m = measurements
+    buffer = m.frames.codes8.to(device)  # once: the others are views of it
+    codes = {"codes8": buffer, "codes16": buffer.view(torch.uint16), "floats": buffer.view(torch.float32)}
+    frames = m.frames._replace(**{n: x.to(device) for n, x in m.frames._asdict().items() if n not in codes}, **codes)
+    empty = None if m.empty is None else move(m.empty)
+    return replace(m, frames=frames, cameras=move(m.cameras), modalities=move(m.modalities), chosen=move(m.chosen), empty=empty)
 
 
 def _rotations_origins(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
