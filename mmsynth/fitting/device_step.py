@@ -144,7 +144,7 @@ class DeviceStep:
         """Lay the small parameters one after the other, the shader's first, in the order that ``learn_all`` sums; where each begins."""
         shader, light = list(self.field.shader.parameters()), self.field.light
         first: list[Tensor] = [*shader, *([] if self.field.far_light is None else [self.field.far_light])]
-        first += [] if light is None else list(light.network()[:6])
+        first += [] if light is None else light.network()[:6]
         place = {id(p): i for i, p in enumerate(first)}
         names = [n for n in self.adam.parameters if n not in _TABLES]
         names.sort(key=lambda n: place.get(id(self.adam.parameters[n]), len(place)))
@@ -155,8 +155,7 @@ class DeviceStep:
         rates = [torch.full((size,), self.adam.rates[n], device=self.field.device) for n, size in zip(names, sizes, strict=True)]
         kinds = [torch.full_like(rate, n.startswith("surface."), dtype=torch.uint8) for n, rate in zip(names, rates, strict=True)]
         values = join(parts)
-        first_moment, second_moment = map(join, moments)
-        flat = _Flat(values, torch.zeros_like(values), first_moment, second_moment, torch.cat(rates), torch.cat(kinds))
+        flat = _Flat(values, torch.zeros_like(values), join(moments[0]), join(moments[1]), torch.cat(rates), torch.cat(kinds))
         begins, begin = {}, 0
         for name, p, size in zip(names, parts, sizes, strict=True):
             own = [x[begin : begin + size].view(p.shape) for x in flat[:4]]
@@ -280,9 +279,8 @@ class DeviceStep:
 
     def _tell(self) -> None:
         """Send what the device tells on its way; the host is never more than ``_AHEAD`` times that far ahead of it."""
-        while len(self.copies) > _AHEAD and (event := self.copies[0][1]) is not None:
-            event.synchronize()
-            self.copies.pop(0)
+        if len(self.copies) > _AHEAD and (oldest := self.copies[0][1]) is not None:
+            oldest.synchronize()
         if self.told.device.type == "cpu":
             self.copies.append((self.told.clone(), None))
             return

@@ -271,10 +271,14 @@ def compare_all(
         partial = new(programs if learn else 0, sum(sizes))
     numbers = len(measured.target)
     out = Compared(
-        torch.empty(programs, dtype=torch.float64, device=device) if loss is None else loss, new(numbers),
-        *(new(*x.shape) if learn else none for x in (rays.features, rays.share)),
-        *(new(numbers) if learn and x is not None else none for x in (gain, mirrored)), partial,
-    )  # fmt: skip
+        torch.empty(programs, dtype=torch.float64, device=device) if loss is None else loss,
+        new(numbers),
+        new(*rays.features.shape) if learn else none,
+        new(*rays.share.shape) if learn else none,
+        new(numbers) if learn and gain is not None else none,
+        new(numbers) if learn and mirrored is not None else none,
+        partial,
+    )
     width = lambda n: max(16, triton.next_power_of_2(n))
     if not programs:
         return out
