@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -148,7 +149,7 @@ def run_job(job: Job) -> dict[str, Any]:
     Raises:
         InputError: the fit was refused or its process died.
     """
-    return in_a_process("mmsynth.bench.worker", job.task(), job.name)
+    return in_a_process("mmsynth.bench.worker", {**job.task(), "began": time.time()}, job.name)
 
 
 def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -275,20 +275,20 @@ OPERATIONS: tuple[Operation, ...] = (
     Operation(
         "compare",
         _compare_inputs,
-        {"torch": _compare(reference), "numba": _compare(cpu), "torch cuda": _compare(reference)},
+        {"torch": _compare(reference), "numba": _compare(cpu), "torch cuda": _compare(reference), "triton": _compare(cuda)},
         leaves=lambda x: [*x["shader"].parameters(), x["features"], x["share"]],
         count=lambda output: len(output[1]),
     ),
     Operation(
         "mirror",
         _mirror_inputs,
-        {"torch": _mirror(reference), "numba": _mirror(cpu), "torch cuda": _mirror(reference)},
+        {"torch": _mirror(reference), "numba": _mirror(cpu), "torch cuda": _mirror(reference), "triton": _mirror(cuda)},
         leaves=lambda x: [x["material"], x["normals"], x["share"], x["position"], x["spectrum"]],
     ),
     Operation(
         "adam",
         _adam_inputs,
-        {"torch": _adam(reference), "numba": _adam(cpu), "torch cuda": _adam(reference)},
+        {"torch": _adam(reference), "numba": _adam(cpu), "torch cuda": _adam(reference), "triton": _adam(cuda)},
         traffic=lambda x, samples: (32 * samples, 32 * samples),
     ),
     # the parts of a trace on a GPU; on the CPU they are fused
@@ -301,13 +301,13 @@ OPERATIONS: tuple[Operation, ...] = (
     Operation(
         "march",
         lambda samples: _rays(samples) | _field(),
-        {"torch": _march(reference), "torch cuda": _march(reference), "triton": _march(cuda)},
+        {"torch": _march(reference), "torch cuda": _march(reference)},
         difference=_march_difference,
     ),
     Operation(
         "section_weights",
         _section_inputs,
-        {"torch": _sections(reference), "torch cuda": _sections(reference), "triton": _sections(cuda)},
+        {"torch": _sections(reference), "torch cuda": _sections(reference)},
         leaves=lambda x: [x["sdf"]],
     ),
 )

@@ -1,7 +1,7 @@
 """One fit, measured: the process that ``jobs.run_job`` starts, ``python -m mmsynth.bench.worker TASK FOLDER``.
 
-TASK is the JSON of a ``Job.task``; the result is written to FOLDER/result.json. The process ends when its standard input does, so that
-the fit of a bench that was killed does not go on beside the next one.
+TASK is the JSON of a ``Job.task`` and ``began``, the time of day at which it was given; the result is written to FOLDER/result.json. The
+process ends when its standard input does, so that the fit of a bench that was killed does not go on beside the next one.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from mmsynth.bench.machine import peak_memory
 from mmsynth.errors import known_error
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_json
+from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
+from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.work_partition import local_device
 from mmsynth.prior.prior import load_prior
@@ -35,8 +37,9 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     Returns:
         ``seconds``: of the fit, from files to a field on disk, without loading the compiled kernels. ``steps``. ``rays_per_s,
         samples_per_s``: of the fit; ``render_rays_per_s``: of the test views. ``cpu_share``: processor time by wall time and threads,
-        lower than usual on a machine that others use, too. ``peak_memory_bytes``: of the process when the fit was done, and on a GPU
-        ``peak_gpu_bytes`` of its tensors. ``scores``: of ``evaluate``.
+        lower than usual on a machine that others use, too. ``startup_seconds``: from the command to the end of the first step, imports
+        and kernels included; ``load_seconds``: of it, from files to the first step. ``peak_memory_bytes``: of the process when the fit
+        was done, and on a GPU ``peak_gpu_bytes`` of its tensors. ``scores``: of ``evaluate``.
     Raises:
         InputError: as ``fit`` and ``evaluate``.
     """
@@ -47,9 +50,18 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         scene_of(task)  # the copy that it takes is made before the clock starts
     prior = None if task["prior"] is None else load_prior(Path(task["prior"]))
     began, cpu = time.perf_counter(), time.process_time()
+    started: dict[str, float] = {}
+
+    def loaded(needs: Needs) -> None:
+        started["load_seconds"] = time.perf_counter() - began
+
+    def stepped(news: FitProgress) -> None:
+        started.setdefault("startup_seconds", time.time() - task["began"])
+
     scene = scene_of(task)
-    length = {"steps": task["steps"], "budget": task["budget"]}
-    field = fit(scene, folder / "run", recipe=Recipe(**task["recipe"]), **length, seed=task["seed"], device=device, prior=prior)
+    length = {"steps": task["steps"], "budget": task["budget"], "seed": task["seed"]}
+    run, recipe = folder / "run", Recipe(**task["recipe"])
+    field = fit(scene, run, recipe=recipe, **length, device=device, prior=prior, on_start=loaded, on_step=stepped)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at, and as it was recorded
@@ -57,6 +69,7 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return {
         "seconds": seconds,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),
+        **started,
         "peak_memory_bytes": peak,
         **({} if device == "cpu" else {"peak_gpu_bytes": torch.cuda.max_memory_allocated(device)}),
         **{key: field.manifest[key] for key in ("steps", "rays_per_s", "samples_per_s")},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -98,6 +99,14 @@ def whole_numbers(text: str, option: str, example: str = "0,1") -> list[int]:
     if not re.fullmatch(r"\d+(,\d+)*", text):
         raise InputError(f"{option} {text!r}: expected numbers such as {example}.")
     return [int(number) for number in text.split(",")]
+
+
+def fractions(text: str, option: str) -> list[Fraction]:
+    """Shares joined by commas."""
+    try:
+        return [Fraction(part) for part in text.split(",")]
+    except (ValueError, ZeroDivisionError) as error:
+        raise InputError(f"{option} {text!r}: expected shares such as 1/8,1/2,1.") from error
 
 
 def lengths(text: str | None) -> list[float] | None:

@@ -18,6 +18,7 @@ from mmsynth.cli.arguments import (
     RunOption,
     SceneArgument,
     fit_length,
+    fractions,
     frame_limits,
     lengths,
     masks_of,
@@ -66,6 +67,40 @@ def bench_fit(
     print_report(report, as_json)
 
 
+@command("size", of=bench_app)
+def bench_size(
+    run: RunOption = None,
+    scales: Annotated[str, typer.Option(help="shares of full size, 2464 pixels in a row")] = "1/8,1/4,1/2,1",
+    views: Annotated[int | None, typer.Option(min=2, help="of the scene, so many; a tenth of them tests; default: all")] = None,
+    budgets: Annotated[str, typer.Option(help="training times, one fit from scratch for each and each scale")] = "10m",
+    scenes_only: Annotated[bool, typer.Option("--scenes-only", help="make the scenes in OUT/scenes, and fit nothing")] = False,
+    recipe: RecipeOption = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    device: DeviceOption = "cpu",
+    out: Annotated[Path, typer.Option(help="what is there already is neither rendered nor fitted again")] = Path("bench/size"),
+    as_json: JsonOption = False,
+) -> None:
+    """The scene of a run as its field shows it to full-size sensors: error over time, start-up and memory by the size of frames."""
+    from mmsynth.bench.size import bench_size as measure
+    from mmsynth.bench.size import make_scenes
+    from mmsynth.fitting.device import pick_device
+    from mmsynth.fitting.recipe import load_recipe
+    from mmsynth.workflows.runs import open_run
+
+    times, wanted = [seconds_of(text, "--budgets") for text in budgets.split(",")], fractions(scales, "--scales")
+    used, opened = load_recipe(recipe), open_run(run)
+    with progress_bar("scenes", as_json) as show:
+        scenes = make_scenes(opened.field, opened.scene, wanted, out, views=views, progress=show)
+    if scenes_only:
+        made = {str(scale): str(path) for scale, path in scenes.items()}
+        print(json.dumps({"scenes": made}) if as_json else "\n".join(f"scale {scale}: {path}" for scale, path in made.items()))
+        return
+    del opened  # the fits need the memory
+    with progress_bar("bench size", as_json) as show:
+        report = measure(scenes, times, out, used, seed, show, pick_device(device))
+    print_report(report, as_json)
+
+
 @command("kernels", of=bench_app)
 def bench_kernels(
     samples: Annotated[int, typer.Option(min=64, help="samples per call")] = 65536,
@@ -79,6 +114,14 @@ def bench_kernels(
     with progress_bar("bench kernels", as_json) as show:
         report = measure(samples, out, threads, progress=show)
     print_report(report, as_json)
+
+
+@command("gpu", of=bench_app)
+def bench_gpu(out: Annotated[Path, typer.Option()] = Path("bench/gpu"), as_json: JsonOption = False) -> None:
+    """What the GPU kernels take of a GPU, found without one: registers, spills and shared memory on sm_80, sm_90 and sm_100."""
+    from mmsynth.bench.gpu import bench_gpu as measure
+
+    print_report(measure(out), as_json)
 
 
 @command("ablation", of=bench_app)

@@ -122,6 +122,9 @@ def fit(
             psnr = " ".join(f"{n} {v:.1f}" for n, v in news.psnr.items())
             show(news.done, 1.0, f"step {news.step}  loss {news.loss:.4f}  psnr {psnr} dB  {news.rays_per_s:,.0f} rays/s")
 
+        def on_load(done: int, total: int) -> None:
+            show(done, total, f"{done} of {total} frames read")
+
         told: set[str] = set()
 
         def explain(choices: dict[str, Choice[Any]]) -> None:
@@ -132,7 +135,8 @@ def fit(
         live = LiveView(loaded, port, say) if view else None
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
-            prior=of_scenes, exposure=stated, checkpoint_every=every, on_start=lambda needs: explain(needs.choices), on_step=on_step,
+            prior=of_scenes, exposure=stated, checkpoint_every=every, on_load=on_load,
+            on_start=lambda needs: explain(needs.choices), on_step=on_step,
             on_field=live,
         )  # fmt: skip
         if live is not None:

@@ -15,7 +15,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.design import Corrections, Design
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Sampling
-from mmsynth.field.kernels.constants import LEAST_WEIGHT
+from mmsynth.field.kernels.learning import normals, with_far_light
 from mmsynth.field.kernels.mirroring import material
 from mmsynth.field.light import Light, mean_spectrum, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
@@ -25,10 +25,11 @@ from mmsynth.field.surface import Surface
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
-from mmsynth.sensors.camera import Camera, ray_map
+from mmsynth.sensors.camera import Camera, unproject
 from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 
 TILE = 8192  # rays at a time: what they need stays in the caches
+_TILES = 32  # whose rays are made together
 MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
@@ -125,15 +126,8 @@ class Field(nn.Module):
         return torch.from_numpy(unit.astype(np.float32)).to(self.device)
 
     def with_far_light(self, hits: rendering.Hits) -> rendering.Hits:
-        """What is shaded. Light from beyond the region has features, too, and no place: only a direction; it is mixed into the last surface
-        of each ray. Where it is modelled, no ray ends in the dark."""
-        if self.far_light is None:
-            return hits
-        last = torch.where(hits.behind >= 0, hits.behind, torch.arange(len(hits.behind), device=hits.behind.device))
-        passed = torch.zeros_like(hits.share).index_add(0, last, 1.0 - hits.opacity)
-        share = hits.share + passed
-        mixed = (passed / share.clamp(min=LEAST_WEIGHT))[:, None]
-        return hits._replace(features=torch.lerp(hits.features, self.far_light.expand_as(hits.features), mixed), share=share)
+        """What is shaded, see ``learning.with_far_light``."""
+        return hits if self.far_light is None else with_far_light(hits, self.far_light)
 
     def slopes(self, points: Tensor, active: int, cells: float = 1.0) -> Tensor:
         """∇sdf (N, 3) in the frame of the grid, at points (N, 3) of the normalised frame, by differences over so many cells."""
@@ -141,9 +135,7 @@ class Field(nn.Module):
 
     def normals(self, points: Tensor, slopes: Tensor) -> Tensor:
         """Unit, outward (N, 3), in the normalised frame, from ``slopes`` at these points."""
-        if self.surface.grid.extent > 1.0:
-            slopes = kernels.contracted_velocity(points, slopes)  # the chain rule: the contraction's Jacobian is symmetric
-        return torch.nn.functional.normalize(slopes, dim=-1)
+        return normals(points, slopes, self.surface.grid.extent)
 
     @torch.no_grad()
     def sdf(self, points: np.ndarray) -> np.ndarray:
@@ -235,7 +227,7 @@ class Field(nn.Module):
     ) -> dict[str, Tensor]:
         """``shade_hits`` of measured modalities."""
         shaded, rays = self.with_far_light(hits), len(directions)
-        ray = kernels.rays_of(hits.behind)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
         lamps = self.light.lamps() if self.light is not None and self.shines and modalities else None
         mirrors = None if lamps is None else self.mirrors(hits, origins, directions, self.sampling.active_surface)[0]
         images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
@@ -309,11 +301,12 @@ class Field(nn.Module):
         """
         if self.light is None:
             raise ValueError("a field without light")
-        ray = kernels.rays_of(hits.behind)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
         points = origins[ray] + directions[ray] * hits.distance[:, None]
         slopes = self.slopes(points.detach(), active, MIRROR_CELLS)
-        normals = self.normals(points.detach(), slopes)
-        return kernels.Mirrors(self.light.material(hits.features), normals, points, directions[ray], hits.share), slopes
+        share = torch.where(hits.distance > 0, hits.share, torch.zeros_like(hits.share))  # without a place there is no normal
+        outward = self.normals(points.detach(), slopes)
+        return kernels.Mirrors(self.light.material(hits.features), outward, points, directions[ray], share), slopes
 
     def mirrored(self, hits: rendering.Hits, origins: Tensor, directions: Tensor, measured: kernels.Measured, active: int) -> Tensor:
         """Mirrored light in each number that was measured along rays, (M,), 0 where nothing shines."""
@@ -357,34 +350,42 @@ class Field(nn.Module):
         pose = np.asarray(camera_to_world, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError(f"pose: expected a finite 4x4 camera_to_world matrix, found shape {pose.shape} or NaN in it.")
-        in_camera, valid = ray_map(camera)
-        height, width = valid.shape
-        rows = np.flatnonzero(valid)
-        directions = in_camera.reshape(-1, 3)[rows]
-        parts: dict[str, list[np.ndarray]] = {}
-        for start in range(0, len(directions), TILE):
-            part = directions[start : start + TILE]
-            for key, value in self.cast(part, pose, names, geometry).items():
-                parts.setdefault(key, []).append(value)
-            if progress is not None:
-                progress(len(part))
+        pixels, valid = camera.width * camera.height, np.zeros(camera.width * camera.height, bool)
+        images: dict[str, np.ndarray] = {}
+        forward = np.zeros(pixels, np.float32)
 
-        def image(key: str, channels: int, fill: float) -> np.ndarray:
-            out = np.full((height * width, channels), fill, np.float32)
-            if key in parts:
-                out[rows] = np.concatenate(parts[key]).reshape(len(rows), channels)
-            return out.reshape(height, width, channels)
+        # rays by parts: those of a whole picture of a full-size sensor would take more memory than what they show
+        for begin in range(0, pixels, _TILES * TILE):
+            index = np.arange(begin, min(begin + _TILES * TILE, pixels))
+            in_camera, seen = unproject(np.stack([index % camera.width, index // camera.width], -1).astype(np.float64), camera)
+            index, in_camera = index[seen], in_camera[seen]
+            valid[index], forward[index] = True, in_camera[:, 2]
+            for start in range(0, len(index), TILE):
+                rows = index[start : start + TILE]
+                for key, value in self.cast(in_camera[start : start + TILE], pose, names, geometry).items():
+                    if key not in images:
+                        images[key] = np.full((pixels, *value.shape[1:]), 0.0 if key == "opacity" else np.nan, np.float32)
+                    images[key][rows] = value
+                if progress is not None:
+                    progress(len(rows))
 
-        depth = image("depth", 1, np.nan)[..., 0] * np.float32(self.region.radius)
+        shape = (camera.height, camera.width)
+
+        def picture(key: str, channels: int, fill: float = np.nan) -> np.ndarray:
+            if key in images:
+                return images[key].reshape(*shape, channels)
+            return np.broadcast_to(np.float32(fill), (*shape, channels))  # of what nothing was seen: no memory
+
+        depth = picture("depth", 1)[..., 0] * np.float32(self.region.radius)
         return Rendering(
-            channels={n: image(n, self.sensors[n].channel_count, np.nan) for n in names},
-            stokes={n: image(f"stokes/{n}", 3, np.nan) for n in names if self.sensors[n].is_polarization},
-            depth_z=(depth * in_camera[..., 2]).astype(np.float32),
+            channels={n: picture(n, self.sensors[n].channel_count) for n in names},
+            stokes={n: picture(f"stokes/{n}", 3) for n in names if self.sensors[n].is_polarization},
+            depth_z=depth * forward.reshape(shape),
             depth_ray=depth,
-            normal=image("normal", 3, np.nan),
-            opacity=image("opacity", 1, 0.0)[..., 0],
-            valid=valid.copy(),
-            deviation={n: image(f"deviation/{n}", self.sensors[n].channel_count, np.nan) for n in names if n in self.predicted},
+            normal=picture("normal", 3),
+            opacity=picture("opacity", 1, 0.0)[..., 0],
+            valid=valid.reshape(shape),
+            deviation={n: picture(f"deviation/{n}", self.sensors[n].channel_count) for n in names if n in self.predicted},
         )
 
     def check_modalities(self, modalities: Sequence[str] | None) -> list[str]:

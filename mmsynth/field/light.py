@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mmsynth.field.kernels import Lamps, Reflection, Surroundings
+from mmsynth.field.kernels import Lamps, LightNetwork, Reflection, Surroundings
 
 LAMPS = 6  # at the most
 _HIDDEN = 32
@@ -67,6 +67,11 @@ class Light(nn.Module):
     def _columns(self) -> Tensor:
         """Of the last layer: all but the visibility of lamps that there are not."""
         return torch.cat([torch.arange(len(_START), device=self.used.device), len(_START) + torch.nonzero(self.used)[:, 0]])
+
+    def network(self) -> LightNetwork:
+        """What a step of a fit takes."""
+        weights = self.first.weight, self.first.bias, self.second.weight, self.second.bias
+        return LightNetwork(*weights, self.position, self.log_spectrum, torch.nonzero(self.used)[:, 0])
 
     def lamps(self) -> Lamps:
         """What the kernels take."""

@@ -29,7 +29,7 @@ class Occupancy(nn.Module):
     def update(
         self, sdf: Callable[[Tensor], Tensor], sharpness: float, generator: torch.Generator, share: float, slack: float = 1.5
     ) -> bool:
-        """Classify all shell cells and a random ``share`` of the others anew.
+        """Classify all shell cells and a ``share`` of the others, every n-th from a random one on, anew.
 
         Args:
             sdf: (N, 3) → (N,). slack: how far |∇sdf| may exceed 1 (it does while training).
@@ -38,8 +38,10 @@ class Occupancy(nn.Module):
         """
         grid = self.states.shape[0]
         flat = self.states.view(-1)
-        again = torch.rand(flat.shape[0], generator=generator) < share
-        cells = torch.nonzero((flat == SHELL) | again.to(flat.device))[:, 0]
+        every = max(1, round(1.0 / share))
+        first = int(torch.randint(every, (1,), generator=generator))
+        again = torch.arange(first, flat.shape[0], every, device=flat.device)
+        cells = again if every == 1 else torch.cat([torch.nonzero(flat == SHELL)[:, 0], again])
         index = torch.stack([cells // (grid * grid), cells // grid % grid, cells % grid], -1)
         margin = slack * self.extent * 3**0.5 / grid + 5.0 / sharpness
         for part in torch.arange(len(cells), device=cells.device).split(65536):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
+
+_BAND = 1 << 18  # pixels
 
 
 @dataclass(frozen=True)
@@ -30,3 +34,19 @@ class Rendering:
     opacity: np.ndarray
     valid: np.ndarray
     deviation: dict[str, np.ndarray]
+
+    def rows(self, rows: slice) -> Rendering:
+        """The same of some rows; its arrays are views of these."""
+
+        def part(value: Any) -> Any:
+            return {name: image[rows] for name, image in value.items()} if isinstance(value, dict) else value[rows]
+
+        return replace(self, **{f.name: part(getattr(self, f.name)) for f in fields(self)})
+
+
+def bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    """The rows of a picture (H, W, ...) in parts of so few pixels that what is computed of one needs little memory."""
+    height, width = shape[:2]
+    step = max(1, _BAND // width)
+    for top in range(0, height, step):
+        yield slice(top, min(top + step, height))

@@ -16,7 +16,7 @@ from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.surface import Surface
 
 NEAR = 0.02  # radii from a camera at which rays begin at the least, when all of space is seen
-_FREE = 0.8  # of the way from a camera to the region of interest, where rays begin then
+FREE = 0.8  # of the way from a camera to the region of interest, where rays begin then
 FARTHEST = 1e3  # where rays end that nothing stops, in radii
 
 
@@ -34,7 +34,7 @@ def interval(surface: Surface, origins: Tensor, directions: Tensor) -> tuple[Ten
     """Where sampling of rays begins and ends: near, far (R,)."""
     if surface.grid.extent > 1.0:
         # a surface right before a camera explains its picture and no other: there is none
-        near = (_FREE * (torch.linalg.vector_norm(origins, dim=-1) - 1.0)).clamp(min=NEAR)
+        near = (FREE * (torch.linalg.vector_norm(origins, dim=-1) - 1.0)).clamp(min=NEAR)
         return near, torch.full_like(near, FARTHEST)
     return ball_interval(origins, directions)
 

@@ -8,9 +8,7 @@ from torch import Tensor, nn
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
-
-# corners of a regular tetrahedron: the four taps of a first derivative, its trace exact for linear functions
-_TAPS = ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, 1.0, 1.0))
+from mmsynth.field.kernels.learning import TAPS
 
 
 class Surface(nn.Module):
@@ -41,7 +39,7 @@ class Surface(nn.Module):
 
     def gradient(self, positions: Tensor, epsilon: float, active: int) -> Tensor:
         """∇sdf by four-tap differences of size ``epsilon`` (Neuralangelo, Li et al. 2023): (N, 3) → (N, 3)."""
-        taps = positions.new_tensor(_TAPS)
+        taps = positions.new_tensor(TAPS)
         shifted = positions[:, None] + taps * (epsilon / 3**0.5)
         values = self(shifted.reshape(-1, 3), active).reshape(-1, 4)
         return (values @ taps) * (3**0.5 / (4 * epsilon))

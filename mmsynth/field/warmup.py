@@ -12,7 +12,7 @@ import torch
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import cpu
-from mmsynth.field.kernels.cpu.optimiser import ADAM_CHUNK
+from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.rendering import trace
@@ -49,8 +49,32 @@ def run_kernels() -> None:
         mirrors = kernels.Mirrors(torch.zeros(1, 6), directions, directions, directions, share)
         loss = loss + kernels.mirror(lamps, mirrors, hits.behind, measured).sum()
         (loss + surface(origins.detach(), 1).sum()).backward()
+        none = torch.empty(0)
+        light = Light(4, 1)
+        rays_of_step = kernels.Rays(origins.detach(), directions, one, 3.0 * one, one - 1.0)
+        kernels.learn(
+            *surface.at(1), appearance.at(1), Occupancy(4).states, weights, light.network(), none, rays_of_step,
+            kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none),
+            kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
+        )  # fmt: skip
     with torch.no_grad():
         kernels.shade(weights, hits.features, directions, 0)
-    for count in (1, ADAM_CHUNK + 1):
-        parameter, gradient, first, second = torch.zeros(4, count)
-        kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
+    _draw()
+    parameter, gradient, first, second = torch.zeros(4, 1)
+    kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
+
+
+def _draw() -> None:
+    """A ray of the only pixel of a frame."""
+    zero, one = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.int32)
+    begins, single = torch.tensor([0, 1], dtype=torch.int32), torch.ones(1)
+    ends, weight = kernels.odds(single, one, begins, 1.0)
+    selection = kernels.Selection(ends, weight, one, torch.tensor([-1]), zero)
+    stored = torch.zeros(4, dtype=torch.uint8)
+    views = stored, stored.view(torch.uint16), stored.view(torch.float32)
+    frames = kernels.Frames(torch.zeros(1, dtype=torch.int64), zero, one, zero, zero, torch.eye(3)[None], torch.zeros(1, 3), *views)
+    cameras = kernels.Cameras(one, one, torch.zeros(1, dtype=torch.int64), one, one, torch.tensor([[0.0, 0.0, 1.0]]))
+    modalities = kernels.Modalities(
+        begins, begins, 8 * one, 4 * one, one, zero, -one, zero, zero, zero, single, single, single, -one, torch.empty(0, 2)
+    )
+    kernels.draw(frames, cameras, modalities, selection, [1], (0, 0))

@@ -39,9 +39,9 @@ class Look:
 
 
 @torch.no_grad()
-def look(field: Field, measurements: dict[str, Measurements], rays: int, sampling: kernels.Sampling, random: np.random.Generator) -> Look:
+def look(field: Field, measurements: Measurements, rays: int, sampling: kernels.Sampling, random: np.random.Generator) -> Look:
     """So many rays of each modality, as the field renders them."""
-    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, field.device)
+    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random)
     jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
     return Look(batch, hits, field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface))

@@ -38,7 +38,7 @@ class Decisions:
         return {**{f"view_dependence.{name}": choice for name, choice in self.view_dependence.items()}, "exposure": self.exposure}
 
 
-def decide(field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
+def decide(field: Field, measurements: Measurements, recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
     """Put the residuals of a field as it is to the tests of this module."""
     random = np.random.default_rng((seed, 2))
     learned, judged = (look(field, measurements, rays, sampling, random) for rays in (_RAYS // 2, _RAYS))
@@ -72,9 +72,9 @@ def _degree(errors: Tensor, degree: int) -> Choice[int]:
 
 
 @torch.no_grad()
-def _exposure(field: Field, judged: Look, measurements: dict[str, Measurements], recipe: RadianceRecipe) -> Choice[bool]:
+def _exposure(field: Field, judged: Look, measurements: Measurements, recipe: RadianceRecipe) -> Choice[bool]:
     batch, hits = judged.batch, judged.hits
-    ray = kernels.rays_of(hits.behind)
+    ray = kernels.rays_of(hits.behind, len(hits.share))
     outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
     predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind) + judged.mirrored
     spreads = {}

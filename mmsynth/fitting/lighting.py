@@ -36,19 +36,19 @@ class _Look:
 
 
 @torch.no_grad()
-def _look(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> _Look:
+def _look(field: Field, measurements: Measurements, sampling: kernels.Sampling, seed: int) -> _Look:
     random = np.random.default_rng((seed, 9))
-    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random, field.device)
+    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random)
     jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-    ray = kernels.rays_of(hits.behind)
+    ray = kernels.rays_of(hits.behind, len(hits.share))
     points = batch.origins[ray] + batch.directions[ray] * hits.distance[:, None]
     normals = field.normals(points, field.slopes(points, sampling.active_surface, MIRROR_CELLS))
     return _Look(batch, hits, points, normals, batch.directions[ray])
 
 
 @torch.no_grad()
-def look_for_lamps(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> int:
+def look_for_lamps(field: Field, measurements: Measurements, sampling: kernels.Sampling, seed: int) -> int:
     """Put lamps into a field's light where mirrored rays are brighter than their surfaces, and than its lamps so far make them: how many.
 
     The directions are those of ``find_lamps``, the distance is a guess that the fit improves. Not for once: while surfaces are not yet
@@ -81,9 +81,7 @@ def look_for_lamps(field: Field, measurements: dict[str, Measurements], sampling
     return len(lamps)
 
 
-def decide_light(
-    field: Field, measurements: dict[str, Measurements], recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int
-) -> Choice[bool]:
+def decide_light(field: Field, measurements: Measurements, recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Choice[bool]:
     """Whether the lamps of a field that has learned with them are worth it.
 
     Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``.
@@ -107,7 +105,7 @@ def decide_light(
 
 
 @torch.no_grad()
-def keep_bright_lamps(field: Field, measurements: dict[str, Measurements], sampling: kernels.Sampling, seed: int) -> int:
+def keep_bright_lamps(field: Field, measurements: Measurements, sampling: kernels.Sampling, seed: int) -> int:
     """Give up the lamps of which surfaces mirror next to nothing: how many are left."""
     seen = look(field, measurements, _RAYS // 2, sampling, np.random.default_rng((seed, 11)))
     light, batch = field.light, seen.batch

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -12,14 +14,15 @@ from torch import Tensor
 
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
-from mmsynth.fitting.importance import Importance
-from mmsynth.fitting.pixels import Pixels
-from mmsynth.scene.images import load_frame
+from mmsynth.fitting.directions import pixel_directions
+from mmsynth.fitting.stored_frames import KINDS, OnLoad, in_threads, read_frames
+from mmsynth.fitting.tiles import Tile, Tiled, all_pixels, joined, selection_of, some_pixels, tile_size
 from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, MaskMeaning, Region, Scene, Sensor
-from mmsynth.sensors.camera import Camera, ray_map
-from mmsynth.sensors.mosaic import channel_map
-from mmsynth.sensors.polarization import analyser_axes
+from mmsynth.sensors.camera import Camera
+
+Table = TypeVar("Table", kernels.Frames, kernels.Cameras, kernels.Modalities, kernels.Selection)
+_TYPICAL = 1 << 18  # pixels, by which the level of a modality is known
 
 
 @dataclass(frozen=True)
@@ -27,22 +30,24 @@ class Batch:
     """R rays of all modalities in the normalised frame, and the M numbers measured along them.
 
     Attributes:
-        origins, directions: (R, 3). measured: the numbers; those of one modality lie together.
-        frame: (M,) int64, counted through the modalities in the order of ``parts``.
+        origins, directions: (R, 3). jitter: (R,) random numbers in [0, 1), for the samples along rays.
+        measured: the numbers; those of one modality lie together.
+        frame: (M,) int64, counted through the modalities in the order of batches.
         parts: per modality its rays and its numbers.
         alpha: (R,) opacity to match, NaN = none.
         ray_weight: (R,), as rays were drawn more or less often than evenly; within ``measured.weight``, too.
-        pixels: of each modality, which of its ``Measurements.pixels`` its rays are.
+        tile: (R,) int64, that of each ray's pixel.
     """
 
     origins: Tensor
     directions: Tensor
+    jitter: Tensor
     measured: kernels.Measured
     frame: Tensor
     parts: dict[str, tuple[slice, slice]]
     alpha: Tensor
     ray_weight: Tensor
-    pixels: dict[str, np.ndarray]
+    tile: Tensor
 
     def per_ray(self, values: Mapping[str, float]) -> Tensor:
         """A value for each modality → one for each ray, (R,)."""
@@ -50,241 +55,312 @@ class Batch:
         return torch.from_numpy(np.repeat([values[n] for n in self.parts], counts)).to(self.origins.device)
 
 
-class Measurements:
-    """All training pixels of one modality.
-
-    Integer images stay integers (8 or 16 bit), so a scene takes the memory of its files, decoded, and no more.
+@dataclass
+class Modality:
+    """What is known of the training frames of a sensor.
 
     Attributes:
+        cameras: without repetition. camera_index: (F,), of each frame.
+        rotations, origins: (F, 3, 3), (F, 3) float32, camera to world, normalised frame.
+        digests: of each frame, a hash of its values.
+        total: how many pixels. pixels: of these, how many numbers are learned from: with a ray, and within the mask where masks are
+            ``object`` or ``ignore``. empty: with a ray outside an object's mask: nothing is there.
+        masked: frames with a mask that is learned from. has_alpha: whether a frame has alpha.
         radiance_scale: the mean of its values, by which residuals are compared with those of other modalities.
-        pixels: those whose numbers are learned from: with a ray, and within the mask where masks are ``object`` or ``ignore``.
-        empty: those with a ray outside an object's mask: nothing is there. None where no frame says so.
-        masked: frames with a mask that is learned from.
     """
 
-    def __init__(self, sensor: Sensor, frames: tuple[Frame, ...], region: Region, masks: MaskMeaning = "off") -> None:
-        self.sensor = sensor
-        self.cameras: list[Camera] = list(dict.fromkeys(f.camera for f in frames))
-        values, alphas = [], []
-        for frame in frames:
-            pixels, alpha = load_frame(sensor, frame)
-            values.append(_compact(pixels.reshape(-1, 1 if pixels.ndim == 2 else pixels.shape[2])))
-            alphas.append(alpha)
-        self.starts = _begins([len(v) for v in values])
-        self.values = _joined(values)
-        has_alpha = any(a is not None for a in alphas)
-        # a frame without alpha beside frames with one is opaque
-        opaque = [np.ones(len(v), np.float32) if a is None else a.reshape(-1) for v, a in zip(values, alphas, strict=True)]
-        self.alphas = _joined([_compact(a) for a in opaque]) if has_alpha else None
-        self.camera_index = np.array([self.cameras.index(f.camera) for f in frames])
-        poses = np.stack([f.camera_to_world for f in frames])
-        poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
-        self.set_poses(poses)
-        directions, valid = zip(*(ray_map(camera) for camera in self.cameras), strict=True)
-        if not all(v.any() for v in valid):
-            raise InputError(f"{sensor.name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
-        # one camera after the other; of each frame, where its camera begins
-        self.directions = np.concatenate([d.reshape(-1, 3).astype(np.float32) for d in directions])
-        channels = [channel_map(sensor.mosaic, c.height, c.width).reshape(-1) for c in self.cameras if sensor.mosaic is not None]
-        self.channels = np.concatenate(channels) if channels else None
-        self.first = _begins([v.size for v in valid])[self.camera_index]
-        self.masked = 0 if masks == "off" else sum(frame.mask is not None for frame in frames)
-        of_frames = [valid[index].reshape(-1) for index in self.camera_index]
-        self.pixels, self.empty = _inside(frames, of_frames, masks) if self.masked else (Pixels(of_frames), None)
-        if not self.pixels.size:
-            raise InputError(
-                f"{frames[0].mask}: this mask of {sensor.name} and those of all its other training frames are empty, "
-                "expected pixels that are not zero."
-            )
-        drawn, pixel = self.pick(min(self.pixels.size, 1 << 18), np.random.default_rng(0))
-        self.radiance_scale = float(self.read(drawn, pixel)[0].mean())
+    sensor: Sensor
+    cameras: list[Camera]
+    camera_index: np.ndarray
+    rotations: np.ndarray
+    origins: np.ndarray
+    digests: Sequence[bytes]
+    total: int
+    pixels: int
+    empty: int
+    masked: int
+    has_alpha: bool
+    radiance_scale: float = math.nan
 
-    def set_poses(self, poses: np.ndarray) -> None:
-        """Let the frames be at (F, 4, 4) camera_to_world, normalised frame."""
-        self.rotations = poses[:, :3, :3].astype(np.float32)
-        self.origins = poses[:, :3, 3].astype(np.float32)
+    @property
+    def values(self) -> int:
+        """Numbers that are measured along a ray."""
+        return _values(self.sensor)
 
     @property
     def has_opacity(self) -> bool:
         """Whether frames say where something is and where nothing: by alpha, or by masks of an object."""
-        return self.alphas is not None or self.empty is not None
-
-    def pick(self, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``count`` pixels, uniform over all frames with replacement: frame and pixel indices, (count,) each."""
-        return self.pixels.at(random.integers(0, self.pixels.size, count))
-
-    def rays(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions, (N, 3) float32 each, normalised frame."""
-        in_camera = self.directions[self.first[frame] + pixel]
-        return self.origins[frame], np.einsum("nij,nj->ni", self.rotations[frame], in_camera)
-
-    def read(self, frame: np.ndarray, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Values (N, K) and alpha (N,) or None, float32. With alpha, values are premultiplied: what the object adds to black."""
-        index = self.starts[frame] + pixel
-        target = _decode(self.values[index])
-        if self.alphas is None:
-            return target, None
-        alpha = _decode(self.alphas[index])
-        return target * alpha[:, None], alpha
-
-    def measured(self, frame: np.ndarray, pixel: np.ndarray) -> np.ndarray | None:
-        """Channel that each pixel of a mosaic measures, (N,) int64; None when pixels measure all channels."""
-        return None if self.channels is None else self.channels[self.first[frame] + pixel]
+        return self.has_alpha or self.empty > 0
 
 
-def in_order(measurements: dict[str, Measurements]) -> list[str]:
-    """The modalities as batches hold them: polarization last."""
-    return sorted(measurements, key=lambda n: measurements[n].sensor.is_polarization)
+@dataclass
+class Measurements(Mapping[str, Modality]):
+    """All training pixels of a scene, by modality, and the tables by which kernels draw them, on one device.
+
+    Attributes:
+        of: the modalities. order: as batches hold them: polarization last.
+        frames, cameras, modalities: in this order.
+        chosen: the pixels that are learned from, all equally often. empty: those where nothing is, None where no frame says so.
+    """
+
+    of: dict[str, Modality]
+    order: tuple[str, ...]
+    frames: kernels.Frames
+    cameras: kernels.Cameras
+    modalities: kernels.Modalities
+    chosen: kernels.Selection
+    empty: kernels.Selection | None
+
+    def __getitem__(self, name: str) -> Modality:
+        return self.of[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.of)
+
+    def __len__(self) -> int:
+        return len(self.of)
+
+    def set_poses(self, name: str, poses: np.ndarray) -> None:
+        """Let the frames of a modality be at (F, 4, 4) camera_to_world, normalised frame."""
+        m = self.of[name]
+        m.rotations, m.origins = _rotations_origins(poses)
+        first = sum(len(self.of[n].origins) for n in self.order[: self.order.index(name)])
+        for all_frames, own in ((self.frames.rotation, m.rotations), (self.frames.origin, m.origins)):
+            all_frames[first : first + len(own)] = torch.from_numpy(own)
 
 
 def draw(
-    measurements: dict[str, Measurements],
-    columns: dict[str, slice],
-    rays: dict[str, int],
+    measurements: Measurements,
+    columns: Mapping[str, slice] | None,
+    rays: Mapping[str, int],
     random: np.random.Generator,
-    device: torch.device,
-    importance: Importance | None = None,
+    selection: kernels.Selection | None = None,
 ) -> Batch:
     """A random batch.
 
     Args:
-        columns: the shader outputs of each modality. rays: how many of each modality. importance: how often to draw each pixel, all
-            alike when None.
+        columns: the shader outputs of each modality, None: each from 0. rays: how many of some modalities.
+        selection: of which pixels, and how often each; None: of all that are learned from, all alike.
     """
-    order = in_order(measurements)
+    order = [n for n in measurements.order if n in rays]
+    modalities = measurements.modalities
+    if columns is not None:
+        output = torch.tensor([columns[n].start if n in rays else 0 for n in measurements.order], dtype=torch.int32)
+        modalities = modalities._replace(output=output.to(modalities.output.device))
+    first, second = random.integers(0, 1 << 32, 2).tolist()
+    drawn = kernels.draw(
+        measurements.frames, measurements.cameras, modalities, measurements.chosen if selection is None else selection,
+        [rays.get(n, 0) for n in measurements.order], (first, second),
+    )  # fmt: skip
     parts: dict[str, tuple[slice, slice]] = {}
-    lists: dict[str, list[np.ndarray]] = {"axes": [np.empty((0, 3), np.float32)]}
-    numbers: dict[str, np.ndarray] = {}
-    r_end = m_end = frames = 0
+    r = m = 0
     for name in order:
-        m, count = measurements[name], rays[name]
-        if importance is None:
-            numbers[name], weight = random.integers(0, m.pixels.size, count), np.ones(count, np.float32)
-        else:
-            numbers[name], weight = importance.draw(name, count, random)
-        frame, pixel = m.pixels.at(numbers[name])
-        origins, directions = m.rays(frame, pixel)
-        target, alpha = m.read(frame, pixel)
-        channel = m.measured(frame, pixel)
-        values = target.shape[1]
-        if m.sensor.polarizer_angles_deg is not None:
-            angles = np.deg2rad(np.array(m.sensor.polarizer_angles_deg, np.float32))
-            angle = angles[channel][:, None] if channel is not None else np.tile(angles, (count, 1))
-            camera_x = torch.from_numpy(np.ascontiguousarray(m.rotations[frame][:, :, 0]))
-            axes = analyser_axes(torch.from_numpy(directions), camera_x, torch.from_numpy(angle))
-            lists["axes"].append(axes.numpy().reshape(-1, 3))
-            output = np.full(count * values, columns[name].start)
-        elif channel is not None:
-            output = columns[name].start + channel
-        else:
-            output = np.tile(np.arange(columns[name].start, columns[name].stop), count)
-        of_all = {"level": m.radiance_scale, "saturation": m.sensor.saturation}
-        drawn = {
-            "origins": origins,
-            "directions": directions,
-            "target": target.reshape(-1),
-            "ray": np.repeat(np.arange(r_end, r_end + count), values),
-            "output": output,
-            "frame": np.repeat(frame + frames, values),
-            "weight": np.repeat(weight / np.float32(len(order) * target.size), values),
-            "ray_weight": weight,
-            "alpha": np.full(count, np.nan if m.empty is None else 1.0, np.float32) if alpha is None else alpha,
-            **{key: np.full(target.size, value, np.float32) for key, value in of_all.items()},
-        }
-        for key, value in drawn.items():
-            lists.setdefault(key, []).append(value)
-        parts[name] = slice(r_end, r_end + count), slice(m_end, m_end + target.size)
-        r_end, m_end, frames = r_end + count, m_end + target.size, frames + len(m.origins)
-    joined = {key: torch.from_numpy(np.concatenate(values)).to(device) for key, values in lists.items()}
-    measured = kernels.Measured(*(joined.pop(key) for key in kernels.Measured._fields))
-    return Batch(**joined, measured=measured, parts=parts, pixels=numbers)
+        count, numbers = rays[name], rays[name] * measurements[name].values
+        parts[name] = slice(r, r + count), slice(m, m + numbers)
+        r, m = r + count, m + numbers
+    return Batch(**drawn._asdict(), parts=parts)
 
 
-def draw_empty(
-    measurements: dict[str, Measurements], rays: dict[str, int], random: np.random.Generator, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Random rays along which nothing is, as masks of an object say: origins and directions, (R, 3) each.
+def draw_empty(measurements: Measurements, rays: Mapping[str, int], random: np.random.Generator) -> Batch:
+    """Random rays along which nothing is, as masks of an object say; what was measured along them means nothing.
 
     Args:
         rays: how many of each modality; those without such masks give none.
     """
-    found = [m.rays(*m.empty.at(random.integers(0, m.empty.size, rays[n]))) for n, m in measurements.items() if m.empty is not None]
-    origins, directions = (torch.from_numpy(np.concatenate(part)).to(device) for part in zip(*found, strict=True))
-    return origins, directions
+    return draw(measurements, None, {n: count for n, count in rays.items() if measurements[n].empty}, random, measurements.empty)
 
 
-def load_measurements(scene: Scene) -> dict[str, Measurements]:
-    """Training pixels per modality.
+def load_measurements(
+    scene: Scene, *, rays_to_come: float = math.inf, device: torch.device | str = "cpu", on_load: OnLoad | None = None
+) -> Measurements:
+    """Training pixels of all modalities.
 
+    Args:
+        rays_to_come: how many a fit will draw, about: the size of tiles follows from it. on_load: news of what was read.
     Raises:
-        InputError: an image or a mask is missing, broken or of the wrong size; a modality has no light in any training frame, or its
-            masks are all empty.
+        InputError: as ``measure``; there is no training frame; a modality has no light in any of them.
     """
-    out = {}
-    for name, sensor in scene.sensors.items():
-        frames = scene.frames_of(name, scene.split.train)
-        if not frames:
-            continue
-        out[name] = Measurements(sensor, frames, scene.region, scene.masks)
-        if not out[name].radiance_scale > 0:
-            raise InputError(f"{frames[0].path.parent}: all training frames of {name} are black, expected some light.")
-    if not out:
+    frames = {name: (sensor, scene.frames_of(name, scene.split.train)) for name, sensor in scene.sensors.items()}
+    frames = {name: (sensor, listed) for name, (sensor, listed) in frames.items() if listed}
+    if not frames:
         raise InputError(f"{scene.root}: no modality has a training frame.")
+    out = measure(frames, scene.region, scene.masks, rays_to_come=rays_to_come, device=device, on_load=on_load)
+    for name, m in out.items():
+        if not m.radiance_scale > 0:
+            raise InputError(f"{frames[name][1][0].path.parent}: all training frames of {name} are black, expected some light.")
     return out
 
 
-def fingerprint(measurements: Mapping[str, Measurements]) -> str:
+def measure(
+    frames: Mapping[str, tuple[Sensor, tuple[Frame, ...]]],
+    region: Region,
+    masks: MaskMeaning = "off",
+    *,
+    rays_to_come: float = math.inf,
+    device: torch.device | str = "cpu",
+    on_load: OnLoad | None = None,
+) -> Measurements:
+    """``load_measurements`` of sensors and their frames.
+
+    Raises:
+        InputError: an image or a mask is missing, broken or of the wrong size; they do not fit into memory; a lens has no ray; the masks of
+            a modality are all empty.
+    """
+    order = tuple(sorted(frames, key=lambda n: frames[n][0].is_polarization))
+    sensors, listed = [frames[n][0] for n in order], [frames[n][1] for n in order]
+    stored = read_frames([(sensor, frame) for sensor, of_sensor in zip(sensors, listed, strict=True) for frame in of_sensor], on_load)
+    cameras = [list(dict.fromkeys(f.camera for f in of_sensor)) for of_sensor in listed]
+    directions, has_ray = pixel_directions([c for of_sensor in cameras for c in of_sensor])
+    first_frame, first_camera = _begins(map(len, listed)), _begins(map(len, cameras))
+    totals = [sum(f.camera.width * f.camera.height for f in of_sensor) for of_sensor in listed]
+    tiles = [tile_size(total, rays_to_come / len(order)) for total in totals]
+    of, camera_of, chosen, empty = {}, [], [], []
+    for n, (name, sensor, of_sensor) in enumerate(zip(order, sensors, listed, strict=True)):
+        index = np.array([cameras[n].index(f.camera) for f in of_sensor])
+        camera_of.append(first_camera[n] + index)
+        usable = [has_ray[c] for c in camera_of[n]]
+        if not all(rays is None or rays.any() for rays in usable):
+            raise InputError(f"{name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
+        masked = 0 if masks == "off" else sum(f.mask is not None for f in of_sensor)
+        inside, outside = _inside_outside(of_sensor, usable, masks if masked else "off", tiles[n])
+        if not inside.pixels.any():
+            raise InputError(
+                f"{of_sensor[0].mask}: this mask of {name} and those of all its other training frames are empty, "
+                "expected pixels that are not zero."
+            )
+        chosen.append(inside)
+        empty.append(outside)
+        poses = np.stack([f.camera_to_world for f in of_sensor])
+        poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
+        own = slice(first_frame[n], first_frame[n + 1])
+        of[name] = Modality(
+            sensor, cameras[n], index, *_rotations_origins(poses), stored.digest[own], totals[n], int(inside.pixels.sum()),
+            int(outside.pixels.sum()), masked, has_alpha=bool((stored.stride[own] > _values(sensor)).any()),
+        )  # fmt: skip
+    pairs = [(tile, f.camera) for tile, of_sensor in zip(tiles, listed, strict=True) for f in of_sensor]
+    first_tile = _begins(math.prod(tile.down_across(c.height, c.width)) for tile, c in pairs)
+    ordered = [of[n] for n in order]
+    frame_table = kernels.Frames(
+        torch.from_numpy(stored.start), torch.from_numpy(stored.kind), torch.from_numpy(stored.stride), _whole(np.concatenate(camera_of)),
+        _whole(first_tile[:-1]), torch.from_numpy(np.concatenate([m.rotations for m in ordered])),
+        torch.from_numpy(np.concatenate([m.origins for m in ordered])),
+        *(torch.from_numpy(stored.data.view(kind)) for kind in KINDS),
+    )  # fmt: skip
+    modalities = _modality_table(ordered, first_frame, first_tile[first_frame], tiles)
+    selected = selection_of(chosen, modalities.first_tile)
+    nothing = selection_of(empty, modalities.first_tile) if any(m.empty for m in ordered) else None
+    out = Measurements({n: of[n] for n in frames}, order, frame_table, directions, modalities, selected, nothing)
+    return _on(_with_levels(out), device)
+
+
+def fingerprint(measurements: Measurements) -> str:
     """Hash of the pixels that are learned from, and of their poses."""
     digest = hashlib.sha256()
-    for name, m in measurements.items():
+    for name in measurements.order:
+        m = measurements[name]
         digest.update(name.encode())
-        for part in (m.origins, m.rotations, m.values):
+        for part in (m.origins, m.rotations):
             digest.update(np.ascontiguousarray(part).tobytes())
-        for chosen in (m.pixels, m.empty) if m.masked else ():
-            digest.update(b"" if chosen is None or chosen.bits is None else chosen.bits.tobytes())
+        for frame in m.digests:
+            digest.update(frame)
+    if any(m.masked for m in measurements.values()):
+        for selection in (measurements.chosen, measurements.empty):
+            digest.update(b"" if selection is None else selection.words.cpu().numpy().tobytes())
     return digest.hexdigest()[:16]
 
 
-def _inside(frames: tuple[Frame, ...], valid: list[np.ndarray], masks: MaskMeaning) -> tuple[Pixels, Pixels | None]:
-    """``pixels`` and ``empty`` of ``Measurements``; ``valid``: (P,) of each frame.
+def _inside_outside(frames: Sequence[Frame], usable: Sequence[np.ndarray | None], masks: MaskMeaning, tile: Tile) -> tuple[Tiled, Tiled]:
+    """The pixels of a modality that are learned from, and those where nothing is.
 
     A frame without a mask beside frames with one: to ignore nothing is to learn from all of it; but what in it is not the object,
     nobody knows, and nothing is learned from it.
+
+    Args:
+        usable: of each frame (H, W) bool, which pixels have a ray, None = all.
     """
-    inside, outside = [], []
-    for frame, usable in zip(frames, valid, strict=True):
-        mask = read_mask(frame)
+    shapes = [(f.camera.height, f.camera.width) for f in frames]
+    none = all_pixels(shapes, tile)
+    none = none._replace(pixels=np.zeros_like(none.pixels))
+    if masks == "off" and all(rays is None for rays in usable):
+        return all_pixels(shapes, tile), none
+
+    def of_frame(i: int) -> tuple[Tiled, Tiled | None]:
+        has_ray = usable[i]
+        rays = np.ones(shapes[i], bool) if has_ray is None else has_ray
+        mask = None if masks == "off" else read_mask(frames[i])
         if mask is None:
-            mask = np.full(usable.shape, masks == "ignore")
-            usable = usable & mask
-        inside.append(usable & mask.reshape(-1))
-        if masks == "object":
-            outside.append(usable & ~mask.reshape(-1))
-    empty = Pixels(outside) if outside else None
-    return Pixels(inside), empty if empty is not None and empty.size else None
+            learned = rays if masks != "object" else np.zeros_like(rays)
+            return some_pixels(learned, tile), some_pixels(np.zeros_like(rays), tile) if masks == "object" else None
+        return some_pixels(rays & mask, tile), some_pixels(rays & ~mask, tile) if masks == "object" else None
+
+    inside, outside = zip(*in_threads(of_frame, len(frames)), strict=True)
+    return joined(inside), joined(outside) if masks == "object" else none
 
 
-def _begins(counts: list[int]) -> np.ndarray:
-    """Where each of several parts begins that lie one after the other."""
-    return np.cumsum([0, *counts])[:-1]
+def _modality_table(
+    modalities: Sequence[Modality], first_frame: np.ndarray, first_tile: np.ndarray, tiles: Sequence[Tile]
+) -> kernels.Modalities:
+    """What kernels are told of modalities; levels and outputs are not known yet."""
+    patterns = [np.empty((0, 0), np.int64) if m.sensor.mosaic is None else m.sensor.mosaic for m in modalities]
+    angles = [np.deg2rad(m.sensor.polarizer_angles_deg or ()) for m in modalities]
+    known = lambda begins, parts: [int(begin) if np.size(part) else -1 for begin, part in zip(begins, parts, strict=False)]
+    single = lambda values: torch.tensor(values, dtype=torch.float32)
+    analysers = np.concatenate([np.stack([np.cos(a), np.sin(a)], -1) for a in angles])
+    return kernels.Modalities(
+        first_frame=_whole(first_frame),
+        first_tile=_whole(first_tile),
+        tile_width=_whole([t.width for t in tiles]),
+        tile_height=_whole([t.height for t in tiles]),
+        values=_whole([m.values for m in modalities]),
+        output=_whole([0] * len(modalities)),
+        pattern_first=_whole(known(_begins(map(np.size, patterns)), patterns)),
+        pattern_height=_whole([p.shape[0] for p in patterns]),
+        pattern_width=_whole([p.shape[1] for p in patterns]),
+        pattern=_whole(np.concatenate([p.reshape(-1) for p in patterns])),
+        level=single([1.0] * len(modalities)),
+        saturation=single([m.sensor.saturation for m in modalities]),
+        opaque=single([1.0 if m.has_opacity else math.nan for m in modalities]),
+        analyser_first=_whole(known(_begins(map(len, angles)), angles)),
+        analysers=torch.from_numpy(analysers.astype(np.float32)),
+    )
 
 
-def _compact(values: np.ndarray) -> np.ndarray:
-    """float32 in [0, 1] → the integers it came from, when it came from 8 or 16 bit; else as it is."""
-    for dtype in (np.uint8, np.uint16):
-        if values.size and values.min() >= 0 and values.max() <= 1:
-            integers = np.rint(values * np.float32(np.iinfo(dtype).max)).astype(dtype)
-            if np.array_equal(_decode(integers), values):
-                return integers
-    return values
+def _with_levels(measurements: Measurements) -> Measurements:
+    for name, m in measurements.items():
+        values = draw(measurements, None, {name: min(m.pixels, _TYPICAL)}, np.random.default_rng(0)).measured.target
+        m.radiance_scale = float(values.double().mean())
+    level = torch.tensor([measurements[n].radiance_scale for n in measurements.order], dtype=torch.float32)
+    return replace(measurements, modalities=measurements.modalities._replace(level=level))
 
 
-def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    """One array of all frames; frames stored in different ways are decoded first."""
-    same = len({p.dtype for p in parts}) == 1
-    return np.concatenate(parts if same else [_decode(p) for p in parts])
+def _on(measurements: Measurements, device: torch.device | str) -> Measurements:
+    m, f = measurements, measurements.frames
+    buffer = f.codes8.to(device)  # once: the others are views of it
+    frames = kernels.Frames(*(x.to(device) for x in f[:-3]), buffer, buffer.view(torch.uint16), buffer.view(torch.float32))
+    return Measurements(
+        m.of, m.order, frames, _moved(m.cameras, device), _moved(m.modalities, device), _moved(m.chosen, device),
+        None if m.empty is None else _moved(m.empty, device),
+    )  # fmt: skip
 
 
-def _decode(stored: np.ndarray) -> np.ndarray:
-    """Back to float32, 1.0 = full scale."""
-    return stored if stored.dtype == np.float32 else stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+def _moved(table: Table, device: torch.device | str) -> Table:
+    return type(table)(*(x.to(device) for x in table))
+
+
+def _rotations_origins(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 4, 4) → (F, 3, 3), (F, 3) float32."""
+    return poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
+
+
+def _values(sensor: Sensor) -> int:
+    """Numbers that are measured along a ray."""
+    return 1 if sensor.mosaic is not None else sensor.channel_count
+
+
+def _whole(values: Sequence[int] | np.ndarray) -> Tensor:
+    return torch.from_numpy(np.asarray(values, np.int32))
+
+
+def _begins(counts: Iterable[int]) -> np.ndarray:
+    """Where each of several parts begins that lie one after the other, and where the last one ends."""
+    return np.cumsum([0, *counts])

@@ -14,7 +14,7 @@ import numpy as np
 
 from mmsynth.field.design import Design
 from mmsynth.fitting.choices import Choice, switch
-from mmsynth.fitting.measurements import Measurements
+from mmsynth.fitting.measurements import Measurements, draw
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
 from mmsynth.scene.scene import MaskMeaning, Scene
@@ -22,6 +22,7 @@ from mmsynth.scene.scene import MaskMeaning, Scene
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
 _OUTERMOST = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
 _COARSE = 128  # cells across the grid that a surface may have however few the measurements: small pictures show large things
+_LOOKED_AT = 4096  # pixels of a modality, to see what is outside
 _PAST = 0.005  # share of the pixels that see past the region, below which nothing is there
 _RAYS_PER_SECOND = 70_000  # of a fit, about: a constant, so that the design does not depend on the clock
 _SAMPLES_PER_RAY = 10  # of a fit, about
@@ -66,7 +67,7 @@ class _Facts:
     that is bright and the mean light, relative to bright pixels; lengths in radii."""
 
     scene: Scene
-    measurements: dict[str, Measurements]
+    measurements: Measurements
     recipe: Recipe
     rays_to_come: float
     pixels: int
@@ -97,13 +98,13 @@ def expected_rays(recipe: Recipe, steps: int | None, budget: float | None) -> fl
     return steps * recipe.sampling.samples_per_step / _SAMPLES_PER_RAY if steps is not None else (budget or 0.0) * _RAYS_PER_SECOND
 
 
-def assess(scene: Scene, measurements: dict[str, Measurements], recipe: Recipe, seed: int, rays_to_come: float) -> Needs:
-    """Look at the cameras and at 4096 random pixels per modality.
+def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, rays_to_come: float) -> Needs:
+    """Look at the cameras and at some random pixels of each modality.
 
     Args:
         rays_to_come: about how many rays the fit will see (``expected_rays``).
     """
-    pixels = sum(m.pixels.size for m in measurements.values())
+    pixels = sum(m.pixels for m in measurements.values())
     seen = _look_outside(measurements, np.random.default_rng((seed, 7)))
     facts = _Facts(scene, measurements, recipe, rays_to_come, pixels, _footprint(measurements), *seen)
     background = _background(facts)
@@ -160,7 +161,7 @@ def _masks(f: _Facts) -> Choice[MaskMeaning]:
         having = sum(frame.mask is not None for frame in frames)
         return Choice("off", f"off: {having} of {len(frames)} training frames have one" + (", they only score" if having else ""), False)
     meaning = f.scene.masks
-    share = ", ".join(f"{n} {m.pixels.size / len(m.values):.1%}" for n, m in masked.items())
+    share = ", ".join(f"{n} {m.pixels / m.total:.1%}" for n, m in masked.items())
     says = {"object": "nothing is outside", "ignore": "what is outside is not learned from"}[meaning]
     why = f"{meaning}: {says}; inside are {share} of the pixels"
     if meaning == "object":
@@ -236,7 +237,7 @@ def _initial_spheres(f: _Facts, background: bool) -> Choice[tuple[float, float]]
 
 def _ray_shares(f: _Facts) -> Choice[dict[str, float]]:
     """Of the rays that each modality gets: 1 where it has enough of the most plentiful one's pixels, else in proportion to its own."""
-    pixels = {n: m.pixels.size for n, m in f.measurements.items()}
+    pixels = {n: m.pixels for n, m in f.measurements.items()}
     enough = f.recipe.sampling.sparse_below * max(count for n, count in pixels.items() if n not in f.unmasked)
     share = {n: min(1.0, count / enough) if enough else 1.0 for n, count in pixels.items()}
     sparse = ", ".join(f"{n} {len(f.measurements[n].origins)} frames" for n, s in share.items() if s < 1.0)
@@ -261,7 +262,7 @@ def _table_rows(f: _Facts) -> Choice[tuple[int, int]]:
     return Choice(rows, f"at most 2^{rows[0]} and 2^{rows[1]} rows a level for {f.rays_to_come:.1e} rays", rows != most)
 
 
-def _footprint(measurements: dict[str, Measurements]) -> float:
+def _footprint(measurements: Measurements) -> float:
     """Median over frames of a pixel's size at the region's centre, in radii; a camera inside counts as one radius away."""
     sizes = []
     for m in measurements.values():
@@ -270,20 +271,20 @@ def _footprint(measurements: dict[str, Measurements]) -> float:
     return float(np.median(np.concatenate(sizes)))
 
 
-def _look_outside(measurements: dict[str, Measurements], random: np.random.Generator) -> tuple[float, float, float, int]:
+def _look_outside(measurements: Measurements, random: np.random.Generator) -> tuple[float, float, float, int]:
     """``outside, bright, light, sampled`` of ``_Facts``."""
     misses = bright = rays = 0
     light = 0.0
-    for m in measurements.values():
-        frame, pixel = m.pick(4096, random)
-        origins, directions = m.rays(frame, pixel)
+    for name in measurements:
+        batch = draw(measurements, None, {name: _LOOKED_AT}, random)
+        origins, directions = batch.origins.cpu().numpy(), batch.directions.cpu().numpy()
         along = np.einsum("ni,ni->n", origins, directions)
         closest = np.linalg.norm(origins - directions * np.minimum(along, 0.0)[:, None], axis=1)
-        values = m.read(frame, pixel)[0].mean(1)
+        values = batch.measured.target.cpu().numpy().reshape(_LOOKED_AT, -1).mean(1)
         missing = closest > 1.0
         misses += int(missing.sum())
         high = max(float(np.quantile(values, 0.95)), 1e-12)
         bright += int((values[missing] > 0.25 * high).sum())
         light += float(values[missing].sum()) / high
-        rays += len(frame)
+        rays += _LOOKED_AT
     return misses / rays, bright / max(misses, 1), light / max(misses, 1), rays

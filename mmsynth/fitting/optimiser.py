@@ -10,8 +10,8 @@ from torch import nn
 
 from mmsynth.field import kernels
 
-_BETAS = (0.9, 0.99)
-_EPSILON = 1e-15
+BETAS = (0.9, 0.99)
+EPSILON = 1e-15
 
 
 class Adam:
@@ -34,13 +34,15 @@ class Adam:
             rows: how many of the first rows of a parameter were ever met: without a gradient the others would stay as they are.
         """
         self.count += 1
+        parts = []
         for name, p in self.parameters.items():
             if p.grad is not None:
                 rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
                 met = slice((rows or {}).get(name))
                 first, second = self.moments[name]
-                step = kernels.AdamStep(rate, *_BETAS, _EPSILON, self.count, name in self.sparse)
-                kernels.adam(p[met], p.grad[met], first[met], second[met], step)
+                step = kernels.AdamStep(rate, *BETAS, EPSILON, self.count, name in self.sparse)
+                parts.append((p[met], p.grad[met], first[met], second[met], step))
+        kernels.adam_together(parts)
 
     def resize(self, name: str, kept: int) -> None:
         """Follow a parameter that has new rows behind its first ``kept``."""

@@ -80,7 +80,9 @@ class RadianceRecipe(_Section):
 class SamplingRecipe(_Section):
     """Which rays a step draws, and where samples lie along them."""
 
-    samples_per_step: int = _key(16384, "Surface samples of an optimiser step [samples]; the number of rays follows.", ge=256)
+    samples_per_step: int = _key(
+        16384, "Surface samples of an optimiser step [samples]; the number of rays follows. On a GPU 262144 at least.", ge=256
+    )
     initial_rays: int = _key(256, "Rays of the first step [rays].", ge=1)
     evenly: float = _key(
         0.5, "Share of the rays that are drawn evenly from all pixels [1]; the others go where residuals are large.", gt=0, le=1

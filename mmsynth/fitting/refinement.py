@@ -16,7 +16,7 @@ from mmsynth.field.design import Corrections
 from mmsynth.field.field import Field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.choices import Choice, switch
-from mmsynth.fitting.measurements import Batch, Measurements, in_order
+from mmsynth.fitting.measurements import Batch, Measurements
 from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian
 from mmsynth.fitting.recipe import PosesRecipe
 from mmsynth.scene.scene import Scene
@@ -57,7 +57,7 @@ def ray_residuals(
     try:
         with torch.enable_grad():
             hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
-            shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind)
+            shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind, len(hits.share))
             outputs = field.shader(shaded.features, directions[ray], degrees[ray])
             predicted = kernels.predict(outputs, shaded.share, batch.measured, hits.behind)
             predicted = predicted + field.mirrored(hits, origins, directions, batch.measured, sampling.active_surface)
@@ -79,9 +79,9 @@ class Refinement:
     from where they are then.
     """
 
-    def __init__(self, scene: Scene, measurements: dict[str, Measurements], recipe: PosesRecipe, footprint: float, seed: int) -> None:
+    def __init__(self, scene: Scene, measurements: Measurements, recipe: PosesRecipe, footprint: float, seed: int) -> None:
         self.measurements, self.recipe, self.prior, self.seed = measurements, recipe, _PRIOR * footprint, seed
-        frames = [f for n in in_order(measurements) for f in scene.frames_of(n, scene.split.train)]
+        frames = [f for n in measurements.order for f in scene.frames_of(n, scene.split.train)]
         self.region = scene.region
         self.layout = poses.layout_of(frames, tuple(measurements), scene.region)
         self.motions = Motions(np.zeros((len(self.layout.views), 6)), np.zeros((len(self.layout.sensors), 6)))
@@ -158,7 +158,7 @@ class Refinement:
     def _set_poses(self) -> None:
         now = poses.moved(self.layout, self.motions)
         for s, name in enumerate(self.layout.sensors):
-            self.measurements[name].set_poses(now[self.layout.sensor == s])
+            self.measurements.set_poses(name, now[self.layout.sensor == s])
 
     def corrections(self) -> Corrections:
         """The motions in the scene's frame and unit; those of sensors and views that have none are left out."""

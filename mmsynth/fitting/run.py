@@ -28,6 +28,7 @@ from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.signals import delayed_signals
+from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.prior.prediction import common, predict, scene_facts
 from mmsynth.prior.prior import Prior
@@ -55,6 +56,7 @@ def fit(
     prior: Prior | None = None,
     exposure: Exposure | None = None,
     checkpoint_every: float = CHECKPOINT_EVERY,
+    on_load: OnLoad | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
     on_field: Callable[[Field], None] | None = None,
@@ -68,6 +70,7 @@ def fit(
         device: cpu or cuda. resume: go on from the run's checkpoint, if it has one.
         prior: to predict modalities that the scene lacks. exposure: of the scene; None: what it states.
         checkpoint_every: seconds.
+        on_load: called as frames are read, with how many were and how many there are.
         on_start: called once with what the scene was found to need. on_step: called after every step. on_field: called then with the field
             as it is, which it may render.
     Raises:
@@ -90,7 +93,7 @@ def fit(
         warm_up()
     recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     taught = scene if prior is None else _without_sparse(scene, prior, recipe)
-    trainer = Trainer(taught, recipe, steps, budget, seed, device)
+    trainer = Trainer(taught, recipe, steps, budget, seed, device, on_load)
     log: list[str] = []
     for folder in (run, run / CHECKPOINT_FOLDER):
         remove_leftovers(folder)

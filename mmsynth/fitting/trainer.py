@@ -6,33 +6,39 @@ import functools
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from pydantic import TypeAdapter
+from torch.nn.functional import pad
 
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field import kernels, rendering
-from mmsynth.field.field import Field
-from mmsynth.fitting import losses
+from mmsynth.field.field import MIRROR_CELLS, Field
+from mmsynth.field.light import Light
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
-from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, in_order, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
 
+if TYPE_CHECKING:
+    from mmsynth.fitting.device_step import DeviceStep
+
 _GAINS = "exposure.log_gain"
 _BAD_STEPS = 20
+_MOST_RAYS = 65536
 _OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (measured on one scene)
 _RENEW_EVERY = 16  # steps: where rays go
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
@@ -76,14 +82,17 @@ class Trainer:
     for any interruption; with ``budget`` it follows the clock.
     """
 
-    def __init__(self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str) -> None:
+    def __init__(
+        self, scene: Scene, recipe: Recipe, steps: int | None, budget: float | None, seed: int, device: str, on_load: OnLoad | None = None
+    ) -> None:
         if (steps is None) == (budget is None):
             raise InputError("fit: give either a number of steps or a time budget, not both.")
         self.recipe, self.steps, self.budget, self.seed = recipe, steps, budget, seed
         self.device = torch.device(device)
         torch.manual_seed(seed)
-        self.measurements: dict[str, Measurements] = load_measurements(scene)
-        self.needs: Needs = assess(scene, self.measurements, recipe, seed, expected_rays(recipe, steps, budget))
+        rays_to_come = expected_rays(recipe, steps, budget)
+        self.measurements: Measurements = load_measurements(scene, rays_to_come=rays_to_come, device=self.device, on_load=on_load)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come)
         sensors = {n: m.sensor for n, m in self.measurements.items()}
         radiance_scale = {n: m.radiance_scale for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
@@ -100,12 +109,21 @@ class Trainer:
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
+        self.no_light = Light(self.field.appearance.width, self.field.shader.heads.out_features).to(self.device)
         self.state = _State(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
-        self.importance = Importance({n: m.pixels.size for n, m in self.measurements.items()}, recipe.sampling.evenly)
+        self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
-        self.has_empty = any(m.empty is not None for m in self.measurements.values())
+        self.has_empty = self.measurements.empty is not None
+        self.on_device: DeviceStep | None = None
+        if self.device.type == "cuda" and kernels.fused_on_gpu():
+            from mmsynth.fitting.device_step import DeviceStep
+
+            given = self.field, self.measurements, self.importance, self.optimiser, self.log_gain, self.needs, recipe, seed
+            self.on_device = DeviceStep(*given)
+            self.state.rays = max(self.state.rays, self.on_device.first_rays)
+        self.prepared: tuple[Any, ...] = ()  # of the last step on the device, what was then
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -140,27 +158,61 @@ class Trainer:
         generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         sampling = sampling_at(self.progress, self.recipe, self.needs)
         self._prepare(sampling, generator)
+        if self.on_device is not None:
+            self._step_on(self.on_device, sampling)
+            return
         batch = self._draw(random)
-        loss, squared, samples = self._loss(batch, sampling, generator)
-        if self.has_empty:
-            opacity, more = self._opacity_outside(random, sampling, generator)
-            loss, samples = loss + self.recipe.loss.alpha_weight * opacity.square().mean(), samples + more
-        wrong = self._differentiate(loss)
+        learned = self._learn(batch, sampling, random, generator)
+        wrong = self._wrong(learned.loss)
         if wrong is not None:
             self._skip(wrong)
             return
         self._update(sampling)
         keep = 0.98 if state.step else 0.0
-        value, before = float(loss.detach()), state.mean_loss
+        value, before, samples = float(learned.loss), state.mean_loss, int(learned.samples)
         state.mean_loss = value if math.isnan(before) else keep * before + (1 - keep) * value  # nan: all were skipped
-        for name, error in self._errors(batch, squared).items():
+        for name, error in self._errors(batch, learned.squared).items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(batch.origins)
         state.samples_total += samples
-        # a fixed number of samples a step; the number of rays follows, by at most a factor of two either way
-        ratio = min(2.0, max(0.5, self.recipe.sampling.samples_per_step / max(samples, 1)))
-        state.rays = int(min(65536, max(len(batch.parts), 0.5 * state.rays * (1 + ratio))))
+        self._adapt_rays(self.recipe.sampling.samples_per_step, samples, _MOST_RAYS)
         state.step += 1
+
+    def _adapt_rays(self, wanted: int, samples: float, most: int) -> None:
+        """A fixed number of samples a step: the number of rays follows, by at most a factor of two either way."""
+        ratio = min(2.0, max(0.5, wanted / max(samples, 1)))
+        self.state.rays = int(min(most, max(len(self.measurements), 0.5 * self.state.rays * (1 + ratio))))
+
+    def _step_on(self, step: DeviceStep, sampling: kernels.Sampling) -> None:
+        """A step that the device takes while the host goes on; what earlier ones told is taken in."""
+        state, done = self.state, self.progress
+        prepared = state.step // _RENEW_EVERY, state.light_looks, *(x is None for x in (state.tables, state.light, state.decided))
+        if prepared != self.prepared:
+            step.renew()
+            self.prepared = prepared
+        early = done < self.recipe.schedule.levels_until
+        stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
+        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
+        self._average()
+        state.rays_total += sum(stage.rays)
+        state.step += 1
+        self._hear(step, wait=False)
+
+    def _hear(self, step: DeviceStep, wait: bool) -> None:
+        """Take in what the device tells of the steps before."""
+        state, news = self.state, step.news(wait)
+        if news is None:
+            return
+        state.samples_total += news.samples
+        state.bad_steps += news.bad
+        if state.bad_steps >= _BAD_STEPS:
+            raise DivergedError(f"fit: loss or gradients are not finite in {state.bad_steps} steps (last: before step {state.step}).")
+        if news.steps > news.bad:
+            keep = 0.0 if math.isnan(state.mean_loss) else 0.98 ** (news.steps - news.bad)
+            state.mean_loss = news.loss if keep == 0.0 else keep * state.mean_loss + (1 - keep) * news.loss
+            for name, error in news.errors.items():
+                state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
+        self._adapt_rays(max(self.recipe.sampling.samples_per_step, step.samples), news.samples / news.steps, step.most_rays)
 
     def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
         """What is due before a step: the occupancy grid, where rays go, the rows of the tables, what residuals decide, the poses."""
@@ -195,80 +247,109 @@ class Trainer:
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
 
     def _draw(self, random: np.random.Generator) -> Batch:
-        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.device, self.importance)
+        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.importance.selection)
 
     def _rays(self) -> dict[str, int]:
         """Of a step, how many of each modality."""
         total = sum(self.needs.share.values())
         return {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
 
-    def _opacity_outside(
-        self, random: np.random.Generator, sampling: kernels.Sampling, generator: torch.Generator
-    ) -> tuple[torch.Tensor, int]:
-        """Opacity of some rays outside the object's masks, (R,), which should be 0, and the samples that it took. Their colours are
-        those of a background that is not the object's, or of a picture that was painted white there: they are not looked at."""
-        rays = {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}
-        origins, directions = draw_empty(self.measurements, rays, random, self.device)
-        jitter = torch.rand(len(origins), generator=generator).to(self.device)
-        field = self.field
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, jitter, sampling)
-        return hits.opacity, int(hits.samples)
+    def _rays_outside(self, random: np.random.Generator) -> Batch:
+        """Some rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the
+        object's, or of a picture that was painted white there: they are not looked at."""
+        return draw_empty(self.measurements, {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}, random)
 
-    def _differentiate(self, loss: torch.Tensor) -> str | None:
-        """Gradients of the loss; what is wrong where it or they are not finite, and then no gradient is left."""
-        if not bool(torch.isfinite(loss)):
-            return "the loss is not finite"
-        loss.backward()
+    def _wrong(self, loss: torch.Tensor) -> str | None:
+        """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
         # what is NaN in a sample is NaN in a sum
-        if not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
-            self.optimiser.clear()
-            return "a gradient is not finite"
-        return None
+        if not bool(torch.isfinite(loss)):
+            reason = "the loss is not finite"
+        elif not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
+            reason = "a gradient is not finite"
+        else:
+            return None
+        self.optimiser.clear()
+        return reason
 
     def _update(self, sampling: kernels.Sampling) -> None:
         """A step of the optimiser, and of the mean over the last parameters."""
-        field, done, length = self.field, self.progress, self.recipe.schedule.ema_fraction
+        field, done = self.field, self.progress
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
         surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
         rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
         self.optimiser.step(learning_rate_factor(done, self.recipe), slower, rows)
+        self._average()
+
+    def _average(self) -> None:
+        """Take the parameters into the mean over the last ones, now and then at the end of a fit."""
+        done, length = self.progress, self.recipe.schedule.ema_fraction
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _loss(self, batch: Batch, sampling: kernels.Sampling, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """The loss, the squared residual of each number (M,), and the samples that they took."""
-        recipe, field = self.recipe, self.field
-        jitter = torch.rand(len(batch.origins), generator=generator).to(self.device)
-        hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
-        degrees = batch.per_ray(field.view_dependence)
+    def _learn(self, batch: Batch, sampling: kernels.Sampling, random: np.random.Generator, generator: torch.Generator) -> kernels.Learned:
+        """The loss of a batch; gradients are added to ``grad`` of all that is learned."""
+        field, origins, directions, jitter = self.field, batch.origins, batch.directions, batch.jitter
+        if self.has_empty:
+            more = self._rays_outside(random)
+            origins, directions = torch.cat([origins, more.origins]), torch.cat([directions, more.directions])
+            jitter = torch.cat([jitter, more.jitter])
+        count = len(origins)
+        near, far = rendering.interval(field.surface, origins, directions)
+        rays = kernels.Rays(origins, directions, near, far, jitter)
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
-        trains_geometry = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
-        gain = self._gain_of(batch)
+        trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
+        outside = count - len(trains)
+        view = kernels.View(*(pad(x, (0, outside), value=y) for x, y in ((batch.per_ray(field.view_dependence), 0), (trains, True))))
+        light = field.light if field.light is not None and field.shines else self.no_light
         # light from beyond the region would explain what is in it as long as that has no shape
-        shaded = field.with_far_light(hits) if self.state.decided is not None else hits
-        rays = kernels.ShadedRays(shaded.features, shaded.share, shaded.behind, batch.directions, degrees, trains_geometry)
-        light, slopes = self._mirrored(hits, batch, trains_geometry, sampling) if field.shines else (None, None)
-        loss, squared = kernels.compare(field.shader.weights(), rays, batch.measured, gain, light)
+        far_light = field.far_light if field.far_light is not None and self.state.decided is not None else origins.new_empty(0)
+        log_gain = self.log_gain if self._has_gains else origins.new_empty(0)
+        return kernels.learn(
+            *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
+            field.shader.weights(), light.network(), far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
+            self._opacities(batch, outside), self._eikonal(count, sampling, generator), sampling,
+        )  # fmt: skip
+
+    def _opacities(self, batch: Batch, outside: int) -> kernels.Opacities:
+        """What is known of the opacity of a batch's rays, and that so many rays behind them meet nothing."""
+        recipe, rays, none = self.recipe.loss, len(batch.origins), batch.ray_weight.new_zeros
+        if not (self.has_opacity or self.needs.black_background):
+            return kernels.Opacities(none(0), none(0), none(0))
+        target, weight, linear = none(rays + outside), none(rays + outside), none(rays + outside)
+        weight[rays:] = recipe.alpha_weight / max(outside, 1)
         if self.has_opacity:
             known = torch.isfinite(batch.alpha)
-            off = batch.ray_weight * (hits.opacity - batch.alpha).square()
-            loss = loss + recipe.loss.alpha_weight * off[known].sum() / len(jitter)
-        elif self.needs.black_background:
+            target[:rays] = torch.where(known, batch.alpha, target[:rays])
+            weight[:rays] = recipe.alpha_weight / rays * batch.ray_weight * known
+        else:
             m = batch.measured
-            black = torch.zeros_like(hits.opacity).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
-            loss = loss + recipe.loss.background_opacity_weight * (batch.ray_weight * hits.opacity * black).mean()
-        if recipe.loss.eikonal_weight > 0:
-            found = self._gradients(hits, batch, slopes, sampling, generator)
-            loss = loss + recipe.loss.eikonal_weight * losses.eikonal(*found)
-        return loss, squared, int(hits.samples)
+            black = none(rays).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
+            linear[:rays] = recipe.background_opacity_weight / rays * batch.ray_weight * black
+        return kernels.Opacities(target, weight, linear)
+
+    def _eikonal(self, rays: int, sampling: kernels.Sampling, generator: torch.Generator) -> kernels.Eikonal:
+        """Where the distance is pulled towards a true one: a quarter of the points in all space, the others within the soft surface, or at
+        all surfaces that rays meet where these shine, whose normals are known."""
+        grid, recipe = self.field.surface.grid, self.recipe
+        count = recipe.loss.eikonal_points if recipe.loss.eikonal_weight > 0 else 0
+        points = (torch.rand(count // 4, 3, generator=generator) * 2 - 1) * grid.extent
+        near = 0 if self.field.shines else count - len(points)
+        noise = torch.randn(near, 3, generator=generator) * (3.0 / sampling.sharpness)
+        cell = grid.cell(sampling.active_surface)
+        # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
+        shallow = recipe.loss.eikonal_shallow_early if self.progress < recipe.schedule.levels_until else 1.0
+        return kernels.Eikonal(
+            points.to(self.device), noise.to(self.device), recipe.loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow
+        )
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
-        out = {}
+        out, residuals = {}, []
         for name, (rays, numbers) in batch.parts.items():
             found = squared[numbers].reshape(rays.stop - rays.start, -1).mean(1)
             out[name] = float((batch.ray_weight[rays] * found).mean())
-            self.importance.learn(name, batch.pixels[name], (found.sqrt() / self.measurements[name].radiance_scale).cpu().numpy())
+            residuals.append(found.sqrt() / self.measurements[name].radiance_scale)
+        self.importance.learn(batch.tile, torch.cat(residuals))
         return out
 
     @property
@@ -284,7 +365,7 @@ class Trainer:
         return self._gain()[batch.frame] if self._has_gains else None
 
     def _look(self, sampling: kernels.Sampling, rays: dict[str, int], random: np.random.Generator) -> RayJacobian:
-        batch = draw(self.measurements, self.field.shader.columns, rays, random, self.device)
+        batch = draw(self.measurements, self.field.shader.columns, rays, random)
         far_light = self.state.decided is not None
         return ray_residuals(self.field, batch, batch.per_ray(self.field.view_dependence), self._gain_of(batch), far_light, sampling)
 
@@ -305,40 +386,6 @@ class Trainer:
     def _see_directions(self, decisions: Decisions) -> None:
         self.field.view_dependence.update({name: choice.value for name, choice in decisions.view_dependence.items()})
 
-    def _mirrored(
-        self, hits: kernels.Hits, batch: Batch, trains_geometry: torch.Tensor, sampling: kernels.Sampling
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mirrored light in each number, (M,), and ∇sdf at the surfaces that mirror it."""
-        light = self.field.light
-        assert light is not None
-        mirrors, slopes = self.field.mirrors(hits, batch.origins, batch.directions, sampling.active_surface)
-        if self.needs.sparse:
-            trains = trains_geometry[kernels.rays_of(hits.behind)]
-            kept = lambda x: torch.where(trains if x.dim() == 1 else trains[:, None], x, x.detach())
-            mirrors = mirrors._replace(material=kept(mirrors.material), normals=kept(mirrors.normals), share=kept(mirrors.share))
-        return kernels.mirror(light.lamps(), mirrors, hits.behind, batch.measured), slopes[hits.distance > 0]
-
-    def _gradients(
-        self, hits: kernels.Hits, batch: Batch, slopes: torch.Tensor | None, sampling: kernels.Sampling, generator: torch.Generator
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """∇sdf at some points of all space, and at what was hit: ``slopes`` where they are known, else around some of the hits, within
-        the soft surface; and the factors where it is below 1."""
-        count = self.recipe.loss.eikonal_points
-        surface = self.field.surface
-        points = [((torch.rand(count // 4, 3, generator=generator) * 2 - 1) * surface.grid.extent).to(self.device)]
-        hit = torch.nonzero(torch.isfinite(hits.depth))[:, 0]
-        if slopes is None and len(hit):
-            chosen = hit[torch.randint(len(hit), (count - len(points[0]),), generator=generator).to(self.device)]
-            noise = torch.randn(len(chosen), 3, generator=generator).to(self.device) * (3.0 / sampling.sharpness)
-            met = batch.origins[chosen] + batch.directions[chosen] * hits.depth[chosen, None]
-            points.append(surface.grid.to_grid(met) + noise)
-        at = torch.cat(points)
-        found, shallow = surface.gradient(at, surface.grid.cell(sampling.active_surface), sampling.active_surface), at.new_ones(len(at))
-        if self.progress < self.recipe.schedule.levels_until:
-            # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
-            shallow[torch.linalg.vector_norm(at, dim=-1) < 1.0] = self.recipe.loss.eikonal_shallow_early
-        return (found, shallow) if slopes is None else (torch.cat([found, slopes]), torch.cat([shallow, at.new_ones(len(slopes))]))
-
     def _skip(self, reason: str) -> None:
         self.state.step += 1
         self.state.bad_steps += 1
@@ -349,7 +396,7 @@ class Trainer:
         """Exposure of each training frame relative to the mean, per modality; empty when no gains were needed."""
         if not self._has_gains:
             return {}
-        order = in_order(self.measurements)
+        order = self.measurements.order
         parts = self._gain().detach().cpu().split([len(self.measurements[n].origins) for n in order])
         return {n: part.tolist() for n, part in zip(order, parts, strict=True)}
 
@@ -362,6 +409,9 @@ class Trainer:
 
     def checkpoint(self) -> dict[str, Any]:
         """All state, as tensors and numbers."""
+        if self.on_device is not None:
+            self._hear(self.on_device, wait=True)
+            self.on_device.sync()
         parts = {name: part.state_dict() for name, part in self.parts.items()}
         return {"task": self.task, "log_gain": self.log_gain.detach(), "state": asdict(self.state), **parts}
 
@@ -385,6 +435,8 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
+        if self.on_device is not None:
+            self.on_device.resume()
         if self.state.decided is not None:
             self._see_directions(self.state.decided)
 

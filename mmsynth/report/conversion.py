@@ -82,7 +82,9 @@ def source_previews(scene: Scene, sensor: Sensor, images: Sequence[Path] = ()) -
 
 
 def _preview(sensor: Sensor, frame: Frame, colours: PreviewColours | None) -> np.ndarray:
-    return previews.to_uint8(previews.tone_map(previews.preview_linear(sensor, measured_channels(sensor, frame), colours)))
+    return previews.to_uint8(
+        previews.reduced(previews.tone_map(previews.preview_linear(sensor, measured_channels(sensor, frame), colours)))
+    )
 
 
 def _row(folder: Path, facts: Mapping[str, Any], frame_of: Callable[[str], np.ndarray | None]) -> Row:

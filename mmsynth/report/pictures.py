@@ -100,21 +100,13 @@ def _encoded(images: Sequence[np.ndarray], most: float) -> list[tuple[str, int, 
     """Pictures of one size → (data URI, width, height): as PNG, or JPEG where that is too long; smaller until they fit."""
     pixels = [previews.as_rgb(image) for image in images]
     for side in _SIDES:
-        reduced = [_reduced(p, side) for p in pixels]
+        reduced = [previews.reduced(p, side) for p in pixels]
         out = [
             min((_data_uri(r, suffix) for suffix in (".png", ".jpg")), key=lambda uri: (len(uri) > most, "png" not in uri)) for r in reduced
         ]
         if all(len(uri) <= most for uri in out) or side == _SIDES[-1]:
             break
     return [(uri, r.shape[1], r.shape[0]) for uri, r in zip(out, reduced, strict=True)]
-
-
-def _reduced(image: np.ndarray, side: int) -> np.ndarray:
-    factor = side / max(image.shape[:2])
-    if factor >= 1.0:
-        return image
-    size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def _data_uri(image: np.ndarray, suffix: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from mmsynth.report.pictures import (
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.preview_colours import preview_colours_of
 from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.sensors.camera import Camera, every_nth
 from mmsynth.sensors.mosaic import channels_of, demosaic_edge_aware, is_bayer
 from mmsynth.sensors.polarization import intensities_to_stokes
 
@@ -44,7 +46,8 @@ def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
 
 @dataclass
 class _Seen:
-    """A modality at a view, before the scale of all errors is known: error (H, W), NaN = no ray, and what comes before and after it."""
+    """A modality at a view, before the scale of all errors is known: error (H, W) of the pixels shown, NaN = no ray, and what comes before
+    and after it."""
 
     title: str
     error: np.ndarray
@@ -54,7 +57,8 @@ class _Seen:
 
 
 def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[Row]]:
-    """Per modality frame | rendering, error, for polarization also AoLP and DoLP; last depth and normals.
+    """Per modality frame | rendering, error, for polarization also AoLP and DoLP; last depth and normals. Of frames of more than 800 pixels
+    in a row or column, every n-th pixel is rendered and shown.
 
     Returns:
         the id of the first test view (None: no frame) and the rows.
@@ -66,7 +70,7 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[Row]]:
     geometry: Row | None = None
     for name in names:
         for frame in frames[name]:
-            rendering = field.render(frame.camera, field.pose_of(frame), [name], geometry=geometry is None)
+            rendering = field.render(_shown_of(frame)[0], field.pose_of(frame), [name], geometry=geometry is None)
             if geometry is None:
                 geometry = _geometry_row(rendering, field.unit, frame.view)
             seen.append(_seen(field, scene, frame, rendering, numbers))
@@ -79,9 +83,16 @@ def picture_rows(field: Field, scene: Scene) -> tuple[int | None, list[Row]]:
     return (None, []) if shown is None or geometry is None else (shown.view, [*rows, geometry])
 
 
+def _shown_of(frame: Frame) -> tuple[Camera, int]:
+    """What of a frame is shown, and every how many-th pixel that is: as many as a page has room for."""
+    n = math.ceil(max(frame.camera.width, frame.camera.height) / previews.LARGEST)
+    return every_nth(frame.camera, n), n
+
+
 def _seen(field: Field, scene: Scene, frame: Frame, rendering: Rendering, numbers: int) -> _Seen:
     name = frame.sensor
-    sensor, measured, ours = field.sensors[name], measured_channels(scene.sensors[name], frame), rendering.channels[name]
+    camera, n = _shown_of(frame)
+    sensor, measured, ours = field.sensors[name], measured_channels(scene.sensors[name], frame)[::n, ::n], rendering.channels[name]
     colours = preview_colours_of(scene.sensors[name], scene.frames_of(name))
     linear = previews.preview_linear(sensor, measured, colours)
     exposure = previews.exposure_of(linear)
@@ -94,7 +105,7 @@ def _seen(field: Field, scene: Scene, frame: Frame, rendering: Rendering, number
         stokes = intensities_to_stokes(torch.from_numpy(measured), sensor.polarizer_angles_deg).numpy()
         after = _polarization(name, stokes, rendering.stokes[name])
     error = np.where(rendering.valid, np.abs(ours - measured).mean(-1), np.nan)
-    spectra = spectra_of(sensor, spectra_width(frame.camera.width, frame.camera.height, numbers), measured=measured, rendered=ours)
+    spectra = spectra_of(sensor, spectra_width(camera.width, camera.height, numbers), measured=measured, rendered=ours)
     return _Seen(name, error, [Wipe(theirs, rendered), rendered], after, spectra)
 
 
@@ -137,7 +148,8 @@ def _geometry_row(rendering: Rendering, unit: str, view: int) -> Row:
 
 def _predicted_rows(field: Field, frame: Frame, numbers: int) -> list[Row]:
     """Of each modality that a prior predicts, at a frame's pose: prediction, deviation, for polarization also AoLP and DoLP."""
-    rendering = field.render(frame.camera, field.pose_of(frame), field.predicted, geometry=False)
+    camera, _ = _shown_of(frame)
+    rendering = field.render(camera, field.pose_of(frame), field.predicted, geometry=False)
     rows = []
     for name in field.predicted:
         sensor, ours, deviation = field.sensors[name], rendering.channels[name], rendering.deviation[name]
@@ -151,7 +163,7 @@ def _predicted_rows(field: Field, frame: Frame, numbers: int) -> list[Row]:
         ]
         if sensor.is_polarization:
             pictures += _polarization(name, None, rendering.stokes[name])
-        width = spectra_width(frame.camera.width, frame.camera.height, numbers)
+        width = spectra_width(camera.width, camera.height, numbers)
         spectra = spectra_of(sensor, width, rendered=ours, deviation=deviation)
         note = "No frame of this modality: a prior of other scenes says what it would have seen, and how sure it is (a scale of its own)."
         rows.append(Row(name, pictures, note, predicted=True, spectra=spectra))

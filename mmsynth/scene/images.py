@@ -14,7 +14,9 @@ import contextlib
 import io
 import re
 import struct
+import threading
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -49,9 +51,12 @@ def read_image(path: Path) -> np.ndarray:
         InputError: missing, truncated or damaged file, unknown type, or NaN / infinity in a float file.
     """
     raw = read_native(path)
-    if raw.dtype.kind == "u":
-        return raw.astype(np.float32) / np.float32(np.iinfo(raw.dtype).max)
-    image = raw.astype(np.float32)
+    return _finite(raw, path) if raw.dtype.kind == "f" else decode(raw)
+
+
+def _finite(raw: np.ndarray, path: Path) -> np.ndarray:
+    """As float32."""
+    image = raw.astype(np.float32, copy=False)
     if not np.isfinite(image).all():
         row, column = np.argwhere(~np.isfinite(image))[0][:2]
         raise InputError(f"{path}: the pixel in row {row}, column {column} is not a finite number.")
@@ -132,27 +137,47 @@ def load_frame(sensor: Sensor, frame: Frame) -> tuple[np.ndarray, np.ndarray | N
     Raises:
         InputError: unreadable file, or size or channel count other than expected.
     """
-    image = read_image(frame.path)
+    image = decode(stored_frame(sensor, frame))
+    if sensor.mosaic is not None:
+        return image[..., 0], None
+    count = sensor.channel_count
+    if image.shape[2] == count:
+        return image, None
+    return np.ascontiguousarray(image[..., :count]), np.ascontiguousarray(image[..., count])
+
+
+def stored_frame(sensor: Sensor, frame: Frame) -> np.ndarray:
+    """``load_frame`` as the file stores it: (H, W, C) uint8, uint16 or float32, C = 1 for a mosaicked sensor; alpha, if any, comes last.
+
+    Raises:
+        InputError: as ``load_frame``.
+    """
+    image = read_native(frame.path)
+    if image.dtype.kind == "f":
+        image = _finite(image, frame.path)
     expected = (frame.camera.height, frame.camera.width)
     if image.shape[:2] != expected:
         raise InputError(
             f"{frame.path}: the image is {image.shape[1]}x{image.shape[0]} pixels, "
             f"expected {expected[1]}x{expected[0]} as the camera of '{sensor.name}' says."
         )
-    if sensor.mosaic is not None:
-        if image.ndim != 2:
-            raise InputError(f"{frame.path}: {image.shape[2]} channels, expected one: the frames of '{sensor.name}' are mosaicked.")
-        return image, None
+    if sensor.mosaic is not None and image.ndim != 2:
+        raise InputError(f"{frame.path}: {image.shape[2]} channels, expected one: the frames of '{sensor.name}' are mosaicked.")
     image = image[..., None] if image.ndim == 2 else image
-    count = sensor.channel_count
-    if image.shape[2] == count:
-        return image, None
-    if count in (1, 3) and image.shape[2] == count + 1:
-        return np.ascontiguousarray(image[..., :count]), np.ascontiguousarray(image[..., count])
+    count = 1 if sensor.mosaic is not None else sensor.channel_count
+    if image.shape[2] == count or (count in (1, 3) and image.shape[2] == count + 1):
+        return image
     if count == 1 and image.shape[2] in (3, 4) and is_grey(image):
-        alone = image[..., :1] if np.ptp(image[..., :3], axis=2).max() == 0 else image[..., :3].mean(2, keepdims=True)
-        return np.ascontiguousarray(alone), np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
+        if np.ptp(image[..., :3], axis=2).max() == 0:
+            return image[..., [0] if image.shape[2] == 3 else [0, 3]]
+        values = decode(image)
+        return np.concatenate([values[..., :3].mean(2, keepdims=True), values[..., 3:]], 2)
     raise InputError(f"{frame.path}: {image.shape[2]} channels, expected {count} for '{sensor.name}'.")
+
+
+def decode(stored: np.ndarray) -> np.ndarray:
+    """Codes of an unsigned integer image, or float32, → float32, 1.0 = full scale."""
+    return stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max) if stored.dtype.kind == "u" else stored
 
 
 def is_grey(image: np.ndarray) -> bool:
@@ -185,14 +210,32 @@ def saturation_level(raw: np.ndarray) -> float:
     return 0.998 * top / (2**bits - 1)
 
 
+class _Silence:
+    """How many threads have OpenCV be silent, and its level before."""
+
+    lock, threads, level = threading.Lock(), 0, 0
+
+
+@contextlib.contextmanager
+def _silent_opencv() -> Iterator[None]:
+    with _Silence.lock:
+        if _Silence.threads == 0:
+            _Silence.level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        _Silence.threads += 1
+    try:
+        yield
+    finally:
+        with _Silence.lock:
+            _Silence.threads -= 1
+            if _Silence.threads == 0:
+                cv2.utils.logging.setLogLevel(_Silence.level)
+
+
 def _read_photo(path: Path) -> np.ndarray:
     data = path.read_bytes()
     _check_photo(data, path)
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said below, in one sentence
-    try:
+    with _silent_opencv():  # what is wrong is said below, in one sentence
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if image is None:
         raise InputError(f"{path}: damaged image, could not be decoded.")
     if image.ndim == 2 or image.shape[2] not in (3, 4):

@@ -25,6 +25,7 @@ COEFFICIENTS: dict[str, tuple[str, ...]] = {
 }
 """Their names, in order."""
 MAX_SIZE = 1_000_000  # pixels: ten times the largest panoramas
+_SMALL = 1 << 18  # pixels: a map of rays of 6.5 MB
 _ON_AXIS = 1e-4  # tan θ below which a fisheye's r_d / r is taken from its series: the next term is 1e-16
 
 
@@ -89,6 +90,14 @@ def resized(camera: Camera, width: int, margin: int = 0) -> Camera:
         fy=camera.fy * y,
         cx=(camera.cx + 0.5) * x - 0.5 + margin,
         cy=(camera.cy + 0.5) * y - 0.5 + margin,
+    )
+
+
+def every_nth(camera: Camera, n: int) -> Camera:
+    """The photosites of every n-th row and column, from the first: pixel (i, j) has the ray of pixel (n i, n j)."""
+    of = lambda size: -(-size // n)
+    return replace(
+        camera, width=of(camera.width), height=of(camera.height), fx=camera.fx / n, fy=camera.fy / n, cx=camera.cx / n, cy=camera.cy / n
     )
 
 
@@ -169,30 +178,35 @@ def unproject(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
     return directions.numpy().reshape(*shape, 3), valid.numpy().reshape(shape)
 
 
-@functools.lru_cache(maxsize=64)
 def ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of all photosites, computed once per camera in float64.
+    """Directions of all photosites in float64, kept for the next call: of many small cameras, or of the last large one.
 
     Returns:
         (H, W, 3) float64 unit vectors in the camera frame and (H, W) bool validity. Do not write to them: they are shared.
     """
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    directions, valid = unproject(np.stack([u, v], -1).astype(np.float64), camera)
+    return (_small_ray_map if camera.width * camera.height <= _SMALL else _large_ray_map)(camera)
+
+
+def _ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    directions, valid = np.empty((camera.height, camera.width, 3)), np.empty((camera.height, camera.width), bool)
+    rows = max(1, _SMALL // camera.width)  # at a time: the inverse of a lens takes ten times the memory of what it gives
+    for top in range(0, camera.height, rows):
+        band = slice(top, min(top + rows, camera.height))
+        v, u = np.mgrid[band, 0 : camera.width]
+        directions[band], valid[band] = unproject(np.stack([u, v], -1).astype(np.float64), camera)
     directions.setflags(write=False)
     valid.setflags(write=False)
     return directions, valid
+
+
+_small_ray_map = functools.lru_cache(maxsize=64)(_ray_map)
+_large_ray_map = functools.lru_cache(maxsize=1)(_ray_map)
 
 
 def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray) -> np.ndarray:
     """Points that pixels see: depth along the ray (H, W) → (H, W, 3) float64, world, NaN where the depth is (kornia's is for pinholes)."""
     directions = ray_map(camera)[0] @ camera_to_world[:3, :3].T
     return camera_to_world[:3, 3] + directions * depth_ray[..., None].astype(np.float64)
-
-
-def depth_along_rays(camera: Camera, depth_z: np.ndarray) -> np.ndarray:
-    """Depth along the optical axis (H, W) → along the ray, float64; NaN where the ray does not lead forward."""
-    forward = ray_map(camera)[0][..., 2]
-    return depth_z.astype(np.float64) / np.where(forward > 0, forward, np.nan)
 
 
 def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:

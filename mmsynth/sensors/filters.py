@@ -6,12 +6,25 @@ running sums (SciPy's ``uniform_filter``, ``cv2.blur``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 
+_BAND = 1 << 18  # pixels
 _MOST_CHANNELS = 128  # that OpenCV 5 filters at once
+
+
+def by_bands(function: Callable[..., np.ndarray], images: Sequence[np.ndarray], reach: int, tile: int = 1) -> np.ndarray:
+    """``function`` of pictures (H, W, ...), each row of which depends on ``reach`` rows above and below: by bands of rows, so that what it
+    computes of a full-size picture needs little memory. Bands begin at multiples of ``tile`` rows."""
+    height, width = images[0].shape[:2]
+    step, margin = (-(-rows // tile) * tile for rows in (max(1, _BAND // width), reach))
+    parts = []
+    for top in range(0, height, step):
+        first, last = max(top - margin, 0), min(top + step + margin, height)
+        parts.append(function(*(image[first:last] for image in images))[top - first : top - first + step])
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def box_mean(image: np.ndarray, size: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_BAND = 1 << 18  # pixels that are demosaicked together
 BAYER = {  # channels 0, 1, 2 = red, green, blue, and OpenCV's name of the pattern: that of the pixels (1, 1) and (1, 2)
     ((0, 1), (1, 2)): cv2.COLOR_BayerBG2RGB_EA,
     ((2, 1), (1, 0)): cv2.COLOR_BayerRG2RGB_EA,
@@ -93,7 +94,18 @@ def photosites_of(image: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 def channels_of(frame: np.ndarray, pattern: np.ndarray | None) -> np.ndarray:
     """``demosaic`` of a frame as files have it: (H, W) → (H, W, C); without a pattern it has all channels already."""
-    return frame if pattern is None else demosaic(torch.from_numpy(frame), pattern).movedim(0, -1).numpy()
+    if pattern is None:
+        return frame
+    # by bands of rows and what of their neighbours they take: all of a full-size frame takes ten times the memory of what it gives
+    height, width = frame.shape
+    rows, reach = pattern.shape[0], max(pattern.shape)
+    step, margin = -(-max(_BAND // width, 4 * reach) // rows) * rows, -(-reach // rows) * rows  # whole tiles: bands keep the phase
+    out = np.empty((height, width, int(pattern.max()) + 1), frame.dtype)
+    for top in range(0, height, step):
+        first, last = max(top - margin, 0), min(top + step + margin, height)
+        found = demosaic(torch.from_numpy(np.ascontiguousarray(frame[first:last])), pattern)
+        out[top : top + step] = found.movedim(0, -1)[top - first : top - first + step].numpy()
+    return out
 
 
 def is_bayer(pattern: np.ndarray) -> bool:

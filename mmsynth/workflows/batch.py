@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mmsynth.errors import InputError, known_error
+from mmsynth.errors import InputError, OutOfMemoryError, known_error
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
 from mmsynth.files import write_json
@@ -73,7 +73,8 @@ def run_batch(
 ) -> dict[str, dict[str, Any]]:
     """Fit every scene and make its dataset, into ``<out>/NAME/run`` and ``<out>/NAME/dataset``; NAME/outcome.json says how it went.
 
-    What is finished is not made again, what was cut off goes on.
+    What is finished is not made again, what was cut off goes on. Under torchrun each process has its own scenes and, by LOCAL_RANK, its own
+    GPU; a scene that is too large for one GPU is not split over several.
 
     Args:
         part: the scenes of this process, None: all. say: told a line per scene.
@@ -91,6 +92,8 @@ def run_batch(
         except Exception as error:  # one scene must not take the others down, whatever it is
             known = known_error(error, str(scene))
             outcome = {"error": f"{scene}: {type(error).__name__}: {error}" if known is None else str(known)}
+            if isinstance(known, OutOfMemoryError) and "CUDA" in str(known):
+                outcome = {"error": f"{scene}: does not fit into the memory of one GPU, and a scene is not split over several."}
         if "error" in outcome:
             say(f"{name}: failed: {outcome['error']}")
         outcomes[name] = {"scene": str(scene), "seconds": time.perf_counter() - began, **outcome}

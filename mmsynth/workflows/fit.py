@@ -11,6 +11,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import CHECKPOINT_EVERY, fit
+from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.progress import Progress
@@ -34,6 +35,7 @@ def fit_run(
     prior: Prior | None = None,
     exposure: Exposure | None = None,
     checkpoint_every: float = CHECKPOINT_EVERY,
+    on_load: OnLoad | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
     on_field: Callable[[Path, Field], None] | None = None,
@@ -60,6 +62,7 @@ def fit_run(
         prior=prior,
         exposure=exposure,
         checkpoint_every=checkpoint_every,
+        on_load=on_load,
         on_start=on_start,
         on_step=on_step,
         on_field=None if on_field is None else functools.partial(on_field, folder),

@@ -33,6 +33,8 @@ def measured(seconds: float = 2.0, **psnr: float) -> dict[str, Any]:
     return {
         "seconds": seconds,
         "cpu_share": 0.9,
+        "startup_seconds": 5.0,
+        "load_seconds": 1.0,
         "peak_memory_bytes": 500_000_000,
         "steps": 100,
         "rays_per_s": 2000.0,

@@ -67,7 +67,7 @@ def test_a_child_that_dies_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_fit_ends_with_the_bench_that_started_it(tmp_path: Path) -> None:
-    task = json.dumps(dataclasses.replace(JOB, steps=None, budget=3600.0).task())
+    task = json.dumps(dataclasses.replace(JOB, steps=None, budget=3600.0).task() | {"began": 0.0})
     command = [sys.executable, "-m", "mmsynth.bench.worker", task, str(tmp_path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, cwd=ROOT, stderr=subprocess.DEVNULL) as child:
         assert child.stdin is not None

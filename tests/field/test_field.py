@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize, softplus
 
 from mmsynth.errors import InputError
+from mmsynth.field import field as fields
 from mmsynth.field import kernels, rendering
 from mmsynth.field.design import Design
 from mmsynth.field.field import Field
@@ -95,6 +96,22 @@ def test_only_what_is_asked_for_is_rendered() -> None:
     assert np.isfinite(whole.depth_ray).sum() > 20 and np.isfinite(whole.normal).sum() > 60
 
 
+def test_a_rendering_does_not_depend_on_how_many_rays_are_made_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    field, camera, pose = _field(False), Camera(19, 13, 12.0, 12.0, 7.5, 5.5, (-0.5, 0.1, 0.0, 0.0)), np.eye(4)
+    pose[2, 3] = -1.5
+    whole = field.render(camera, pose)
+    monkeypatch.setattr(fields, "TILE", 16)
+    monkeypatch.setattr(fields, "_TILES", 4)
+    done: list[int] = []
+    seen = field.render(camera, pose, progress=done.append)
+    assert sum(done) == whole.valid.sum() < whole.valid.size and max(done) == 16
+    for part in ("depth_z", "depth_ray", "opacity", "normal", "valid"):
+        np.testing.assert_allclose(getattr(seen, part), getattr(whole, part), atol=1e-6)
+    for name in whole.channels:
+        np.testing.assert_allclose(seen.channels[name], whole.channels[name], atol=1e-6)
+    np.testing.assert_allclose(seen.stokes["pol"], whole.stokes["pol"], atol=1e-6)
+
+
 def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:
     field = _field(True, Region((10.0, 0.0, -5.0), 3.0))
     x = np.array([[10.0, 0.0, -5.0], [10.0, 1.8, -5.0], [10.0, 0.0, 25.0], [-300.0, 200.0, 0.0]])
@@ -158,7 +175,7 @@ def test_every_modality_has_the_view_dependence_that_it_needs() -> None:
     origins, directions, out = _look_around(field, 100)
     hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, torch.full((100,), 0.5), field.sampling)
     for name, degree in (("rgb", 0), ("nir", 3)):
-        ray = kernels.rays_of(hits.behind)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
         light = hits.share[:, None] * field.shader.values(name, field.shader(hits.features, directions[ray], degree))
         expected = torch.zeros(100, light.shape[1]).index_add(0, ray, light)
         torch.testing.assert_close(out[name], expected.detach(), atol=1e-6, rtol=1e-5)

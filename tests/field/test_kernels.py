@@ -227,7 +227,7 @@ def _quantities(
         module.zero_grad()
     hits = rendering.trace(surface, appearance, occupancy, origins, directions, jitter, sampling)
     weight = torch.linspace(0.5, 1.5, len(origins)).to(jitter)
-    of_row = weight[kernels.rays_of(hits.behind)]
+    of_row = weight[kernels.rays_of(hits.behind, len(hits.share))]
     loss = (hits.features * of_row[:, None]).square().sum() + (hits.opacity * weight).square().sum()
     (loss + 0.5 * (hits.share * of_row).square().sum()).backward()
     return {

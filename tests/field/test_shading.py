@@ -150,7 +150,7 @@ def test_compare(count: int) -> None:
         assert (found["squared"].sqrt() > 0.5 * case.batch.measured.level).any()  # the linear part of the loss, too
         for name in ("features", "share"):
             assert (
-                not found[f"gradient of {name}"][~case.trains_geometry[kernels.rays_of(case.behind)]].any()
+                not found[f"gradient of {name}"][~case.trains_geometry[kernels.rays_of(case.behind, len(case.share))]].any()
                 and found[f"gradient of {name}"].any()
             )
 

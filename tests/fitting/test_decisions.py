@@ -56,7 +56,7 @@ def test_the_degree_that_light_has_is_found(needed: int) -> None:
         batch = Batch(
             origins=torch.zeros(rays, 3), directions=directions, frame=0 * every,
             measured=kernels.Measured(light, every, 0 * every, torch.empty(0, 3), ones, 9 * ones, ones / rays),
-            parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"), ray_weight=ones, pixels={},
+            parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"), ray_weight=ones, jitter=0 * ones, tile=0 * every,
         )  # fmt: skip
         hits = kernels.Hits(torch.zeros(rays, 2), ones, ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
         return Look(batch, hits, torch.zeros(rays))

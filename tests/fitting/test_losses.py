@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -12,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mmsynth.field.kernels import Measured, photometric, predict, residual
-from mmsynth.fitting.losses import eikonal
-from mmsynth.fitting.measurements import Batch, Measurements, draw
+from mmsynth.fitting.measurements import Batch, Measurements, draw, measure
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, project
@@ -47,18 +44,17 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Frame, .
 
 
 @pytest.fixture(scope="module")
-def measurements(frames: dict[str, tuple[Frame, ...]]) -> dict[str, Measurements]:
-    return {s.name: Measurements(s, frames[s.name], REGION) for s in SENSORS}
+def measurements(frames: dict[str, tuple[Frame, ...]]) -> Measurements:
+    return measure({s.name: (s, frames[s.name]) for s in SENSORS}, REGION)
 
 
 RAYS = {"pol": 31, "rgb": 40, "film": 7, "mono": 1, "pol3": 12}
 COLUMNS = {"pol": slice(0, 6), "rgb": slice(6, 9), "film": slice(9, 12), "mono": slice(12, 13), "pol3": slice(13, 19)}
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def batch(measurements: dict[str, Measurements]) -> Batch:
-    return draw(measurements, COLUMNS, RAYS, np.random.default_rng(5), CPU)
+def batch(measurements: Measurements) -> Batch:
+    return draw(measurements, COLUMNS, RAYS, np.random.default_rng(5))
 
 
 def test_a_batch_joins_all_modalities(batch: Batch) -> None:
@@ -128,7 +124,7 @@ def test_every_number_is_of_the_pixel_its_ray_goes_through(batch: Batch, frames:
         begin += FRAMES
 
 
-def test_levels_saturations_and_weights_are_the_modalitys(batch: Batch, measurements: dict[str, Measurements]) -> None:
+def test_levels_saturations_and_weights_are_the_modalitys(batch: Batch, measurements: Measurements) -> None:
     for name, (_, numbers) in batch.parts.items():
         m = measurements[name]
         assert (batch.measured.level[numbers] == np.float32(m.radiance_scale)).all()
@@ -137,18 +133,18 @@ def test_levels_saturations_and_weights_are_the_modalitys(batch: Batch, measurem
     assert float(batch.measured.weight.sum()) == pytest.approx(1.0)
 
 
-def test_a_batch_without_polarization_has_no_axes(measurements: dict[str, Measurements]) -> None:
+def test_a_batch_without_polarization_has_no_axes(measurements: Measurements) -> None:
     names = ("rgb", "mono")
-    batch = draw({n: measurements[n] for n in names}, COLUMNS, dict.fromkeys(names, 5), np.random.default_rng(0), CPU)
+    batch = draw(measurements, COLUMNS, dict.fromkeys(names, 5), np.random.default_rng(0))
     assert batch.measured.axes.shape == (0, 3)
     outputs = torch.randn(10, 19)
     torch.testing.assert_close(predict(outputs, torch.ones(10), batch.measured), _predicted_plainly(outputs, torch.ones(10), batch))
-    only = draw({"pol": measurements["pol"]}, COLUMNS, {"pol": 5}, np.random.default_rng(0), CPU)
+    only = draw(measurements, COLUMNS, {"pol": 5}, np.random.default_rng(0))
     torch.testing.assert_close(predict(outputs[:5], torch.ones(5), only.measured), _predicted_plainly(outputs[:5], torch.ones(5), only))
 
 
-def test_the_same_random_state_draws_the_same_batch(measurements: dict[str, Measurements]) -> None:
-    a, b, c = (draw(measurements, COLUMNS, RAYS, np.random.default_rng(seed), CPU) for seed in (1, 1, 2))
+def test_the_same_random_state_draws_the_same_batch(measurements: Measurements) -> None:
+    a, b, c = (draw(measurements, COLUMNS, RAYS, np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert (
         torch.equal(a.measured.target, b.measured.target)
         and torch.equal(a.measured.axes, b.measured.axes)
@@ -211,7 +207,8 @@ def _alone(target: list[float], saturation: float, level: float) -> Batch:
     output, no_axes = 0 * number, torch.empty(0, 3)
     measured = Measured(torch.tensor(target), number, output, no_axes, full(level), full(saturation), full(1 / count))
     parts = {"mono": (slice(0, count), slice(0, count))}
-    return Batch(torch.zeros(count, 3), torch.zeros(count, 3), measured, 0 * number, parts, full(float("nan")), full(1.0), {})
+    zero, none = torch.zeros(count, 3), full(float("nan"))
+    return Batch(zero, zero, full(0.5), measured, 0 * number, parts, none, full(1.0), 0 * number)
 
 
 def test_saturated_targets_only_pull_upwards() -> None:
@@ -227,30 +224,3 @@ def test_dark_modalities_weigh_as_much_as_bright_ones(level: float) -> None:
     relative = torch.linspace(-2, 2, 9)
     loss = photometric(relative * level, _alone([0.0] * 9, 1.0, level).measured)
     assert float(loss) == pytest.approx(float(photometric(relative, _alone([0.0] * 9, 1.0, 1.0).measured)), rel=1e-5)
-
-
-def test_eikonal_is_zero_for_distances_alone() -> None:
-    units = torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
-    assert float(eikonal(units)) < 1e-12
-    assert float(eikonal(torch.tensor([[3.0, 0.0, 4.0], [0.0, 1.0, 0.0]]))) == pytest.approx(8.0)
-    slopes = torch.tensor([[0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 1.5, 0.0]])
-    assert float(eikonal(slopes, torch.tensor([0.1, 1.0, 0.1]))) == pytest.approx((0.1 + 1.0 + 1.0) / 3 * 0.25)
-
-
-def test_integers_stay_integers_in_memory(tmp_path: Path) -> None:
-    """16-bit frames take 16 bits; beside a float frame they are decoded."""
-    random, sensor = np.random.default_rng(0), Sensor("mono", ("mono",), (None,))
-    images = [random.integers(0, 65536, (18, 24), dtype=np.uint16), random.integers(0, 256, (18, 24), dtype=np.uint8)]
-    images.append(random.random((18, 24)).astype(np.float32) * 2)
-    listed = []
-    for i, image in enumerate(images):
-        np.save(tmp_path / f"{i}.npy", image)
-        listed.append(Frame("mono", i, tmp_path / f"{i}.npy", CAMERAS[1], ring(3)[i]))
-    for count, dtype in ((1, np.uint16), (2, np.float32), (3, np.float32)):
-        m = Measurements(sensor, tuple(listed[:count]), REGION)
-        assert m.values.dtype == dtype
-        for i in range(count):
-            found, alpha = m.read(np.full(432, i), np.arange(432))
-            expected = load_frame(sensor, listed[i])[0].reshape(-1, 1)
-            assert alpha is None and np.array_equal(found, expected)
-    assert Measurements(sensor, (listed[1],), REGION).values.dtype == np.uint8

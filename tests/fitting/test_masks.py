@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 import torch
 from conftest import ring
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mmsynth.errors import InputError
-from mmsynth.fitting.measurements import Measurements, draw, draw_empty, load_measurements
+from mmsynth.fitting.measurements import draw, draw_empty, load_measurements, measure
 from mmsynth.fitting.needs import Needs, assess
-from mmsynth.fitting.pixels import Pixels
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.trainer import Trainer
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, MaskMeaning, Region, Scene, Sensor, Split
-from mmsynth.sensors.camera import Camera
+from mmsynth.sensors.camera import Camera, project
 
-CPU = torch.device("cpu")
 SENSORS = {
     "rgb": Sensor("rgb", ("R", "G", "B"), (None,) * 3, np.array([[1, 2], [0, 1]])),
     "mono": Sensor("mono", ("mono",), (None,)),
@@ -64,50 +60,46 @@ def _trained(scene: Scene, steps: int) -> Trainer:
     return trainer
 
 
-# --- some of the pixels
-
-
-@given(st.lists(st.tuples(st.integers(1, 300), st.floats(0, 1), st.integers(0, 2**32 - 1)), min_size=1, max_size=5))
-def test_pixels_are_numbered_as_in_a_list_of_them(frames: list[tuple[int, float, int]]) -> None:
-    chosen = [np.random.default_rng(seed).random(length) < share for length, share, seed in frames]
-    pixels = Pixels(chosen)
-    expected = [(frame, pixel) for frame, here in enumerate(chosen) for pixel in np.flatnonzero(here)]
-    assert pixels.size == len(expected) and pixels.counts.tolist() == [here.sum() for here in chosen]
-    assert list(zip(*(x.tolist() for x in pixels.at(np.arange(pixels.size))), strict=True)) == expected
-
-
 # --- what is drawn
 
 
 @pytest.mark.parametrize("masks", ["ignore", "object"])
 def test_no_colour_outside_a_mask_is_ever_drawn(masks: MaskMeaning, tmp_path: Path) -> None:
     measurements = load_measurements(_scene(tmp_path, masks))
-    assert all(m.pixels.size == 5 * DISC.sum() and m.masked == 5 for m in measurements.values())
-    batch = draw(measurements, {"rgb": slice(0, 3), "mono": slice(3, 4)}, {"rgb": 900, "mono": 900}, np.random.default_rng(0), CPU)
+    assert all(m.pixels == 5 * DISC.sum() and m.masked == 5 for m in measurements.values())
+    batch = draw(measurements, {"rgb": slice(0, 3), "mono": slice(3, 4)}, {"rgb": 900, "mono": 900}, np.random.default_rng(0))
     torch.testing.assert_close(batch.measured.target, torch.full((1800,), 0.4), atol=1e-4, rtol=0)
     assert batch.alpha.isnan().all() if masks == "ignore" else (batch.alpha == 1.0).all()
     assert all(m.radiance_scale == pytest.approx(0.4, abs=1e-4) for m in measurements.values())
-    every = {tuple(x) for x in np.stack(measurements["mono"].pick(20_000, np.random.default_rng(1)), 1).tolist()}
-    assert every == {(frame, pixel) for frame in range(5) for pixel in np.flatnonzero(DISC)}
+    batch = draw(measurements, None, {"mono": 20_000}, np.random.default_rng(1))
+    turn = measurements.frames.rotation[batch.frame]
+    in_camera = torch.einsum("nji,nj->ni", turn, batch.directions).double().numpy()
+    column, row = np.rint(project(in_camera, CAMERA)).astype(int).T
+    first = int(measurements.modalities.first_frame[measurements.order.index("mono")])
+    every = set(zip((batch.frame - first).tolist(), row.tolist(), column.tolist(), strict=True))
+    assert every == {(frame, row, column) for frame in range(5) for row, column in zip(*np.nonzero(DISC), strict=True)}
 
 
 def test_empty_rays_go_through_pixels_outside(tmp_path: Path) -> None:
     measurements = load_measurements(_scene(tmp_path, "object"))
-    origins, directions = draw_empty(measurements, {"rgb": 300, "mono": 500}, np.random.default_rng(0), CPU)
-    assert origins.shape == directions.shape == (800, 3)
+    batch = draw_empty(measurements, {"rgb": 300, "mono": 500}, np.random.default_rng(0))
+    assert batch.origins.shape == batch.directions.shape == (800, 3)
     # the disc is that of a ball around the origin: rays outside pass it
-    closest = torch.linalg.vector_norm(origins - directions * (origins * directions).sum(1, keepdim=True), dim=1)
-    inside = load_measurements(_scene(tmp_path, "ignore"))["mono"]
-    o, d = inside.rays(*inside.pick(500, np.random.default_rng(0)))
-    assert closest.min() > np.linalg.norm(o - d * (o * d).sum(1, keepdims=True), axis=1).max() - 0.03
-    assert all(m.empty is None for m in load_measurements(_scene(tmp_path, "ignore")).values())
+    inside = draw(measurements, None, {"mono": 500}, np.random.default_rng(0))
+    closest, within = (
+        torch.linalg.vector_norm(b.origins - b.directions * (b.origins * b.directions).sum(1, keepdim=True), dim=1) for b in (batch, inside)
+    )
+    assert closest.min() > within.max() - 0.03
+    assert all(m.empty == 5 * (~DISC).sum() for m in measurements.values())
+    ignored = load_measurements(_scene(tmp_path, "ignore"))
+    assert ignored.empty is None and not any(m.empty for m in ignored.values())
 
 
 @pytest.mark.parametrize(("masks", "pixels"), [("ignore", 4 * DISC.sum() + DISC.size), ("object", 4 * DISC.sum())])
 def test_a_frame_without_a_mask_is_all_learned_from_or_not_at_all(masks: MaskMeaning, pixels: int, tmp_path: Path) -> None:
     scene = _scene(tmp_path, masks, without=(("rgb", 2),))
     m = load_measurements(scene)["rgb"]
-    assert m.pixels.size == pixels and m.masked == 4
+    assert m.pixels == pixels and m.masked == 4
     assert ("1 frames of rgb have no mask and are not learned from" in _needs(scene).choices["masks"].why) == (masks == "object")
 
 
@@ -178,5 +170,6 @@ def test_fields_of_an_object_do_not_depend_on_colours_outside(tmp_path: Path) ->
 
 def test_measurements_take_masks_off_unless_told(tmp_path: Path) -> None:
     scene = _scene(tmp_path, "object")
-    m = Measurements(SENSORS["mono"], scene.frames_of("mono"), scene.region)
-    assert m.pixels.size == 6 * DISC.size and m.pixels.bits is None and not m.has_opacity
+    measurements = measure({"mono": (SENSORS["mono"], scene.frames_of("mono"))}, scene.region)
+    m = measurements["mono"]
+    assert m.pixels == 6 * DISC.size and measurements.chosen.first_word.tolist() == [-1] and not m.has_opacity

@@ -165,7 +165,6 @@ def test_a_sparse_modality_leaves_geometry_and_appearance_alone() -> None:
     before = weights.detach().clone()
     tables = {n: p.detach().clone() for n, p in trainer.field.named_parameters() if n.endswith(".table")}
     # without the plentiful modality nothing may move but the sparse one's own colours
-    trainer.measurements.pop("pol")
     trainer.needs.share.pop("pol")
     trainer.run_step()
     for name, p in trainer.field.named_parameters():
@@ -179,7 +178,7 @@ def test_a_sparse_modality_leaves_geometry_and_appearance_alone() -> None:
 def test_a_cell_of_the_surface_is_seen_by_enough_measurements(tmp_path: Path) -> None:
     scene = _scene(tmp_path / "plain")
     measurements = load_measurements(scene)
-    pixels = sum(m.pixels.size for m in measurements.values())
+    pixels = sum(m.pixels for m in measurements.values())
     cells_per_pixel = 32.0  # finer than pixels, so that only the measurements limit it
 
     def at(measurements_per_cell: float) -> Needs:

@@ -200,7 +200,8 @@ def _batch(target: list[float], saturation: float) -> Batch:
     return Batch(
         origins=torch.zeros(1, 3), directions=d,
         measured=kernels.Measured(torch.tensor(target), zeros, zeros, axes, four, saturation * four, 0.25 * four),
-        frame=zeros, parts={"pol": (slice(0, 1), slice(0, 4))}, alpha=torch.full((1,), torch.nan), ray_weight=torch.ones(1), pixels={},
+        frame=zeros, parts={"pol": (slice(0, 1), slice(0, 4))}, alpha=torch.full((1,), torch.nan), ray_weight=torch.ones(1),
+        jitter=torch.zeros(1), tile=zeros[:1],
     )  # fmt: skip
 
 

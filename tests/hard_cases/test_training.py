@@ -13,9 +13,8 @@ from small_scenes import QUICK, RADIUS, around, picture, write_scene
 from usual import nerfacc_keeps, neus_weights
 
 from mmsynth.errors import DivergedError
-from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, reference
+from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, odds, reference
 from mmsynth.field.rendering import ball_interval
-from mmsynth.fitting.importance import RUN, Importance
 from mmsynth.fitting.measurements import draw
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -25,6 +24,7 @@ from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
 
+TILE = 32  # pixels
 Row = Callable[[str, str, str], None]
 
 
@@ -41,10 +41,7 @@ def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
     """The trainer's loss by single operations, of a batch with the bad pixel, and torch's Adam: share of residuals NaN before and after."""
     field, batches = trainer.field, (np.random.default_rng(seed) for seed in range(1000))
     batch = next(
-        b
-        for r in batches
-        for b in [draw(trainer.measurements, field.shader.columns, {"rgb": 128}, r, "cpu")]
-        if b.measured.target.isnan().any()
+        b for r in batches for b in [draw(trainer.measurements, field.shader.columns, {"rgb": 128}, r)] if b.measured.target.isnan().any()
     )
     o, d, zero = batch.origins, batch.directions, torch.zeros(128)
     sampling, optimiser, lost = sampling_at(0.0, trainer.recipe, trainer.needs), torch.optim.Adam(field.parameters(), 1e-3), []
@@ -62,9 +59,10 @@ def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
 def test_one_bad_pixel_spoils_one_step(row: Row, scene: Scene) -> None:
     """A value that turned NaN in memory: steps that meet it change nothing, all others go on."""
     trainer = _trainer(scene)
-    rgb = trainer.measurements["rgb"]
-    rgb.values = rgb.values.astype("float32") / 65535
-    rgb.values[rgb.starts[0] + 40] = math.nan
+    frames = trainer.measurements.frames
+    values = frames.codes16.float() / 65535
+    values[40] = math.nan
+    trainer.measurements.frames = frames._replace(kind=torch.full_like(frames.kind, 2), floats=values)
     skipped = 0
     while trainer.progress < 1:
         before = {n: p.detach().clone() for n, p in trainer.field.named_parameters()}
@@ -222,22 +220,25 @@ def test_a_grid_that_was_emptied_finds_the_scene_again(row: Row, scene: Scene, s
     )
 
 
-def _importance(residual: np.ndarray, evenly: float) -> Importance:
-    """Draws by the residuals of runs (N,), each of which was looked at often."""
-    importance = Importance({"rgb": RUN * len(residual)}, evenly)
-    for _ in range(60):
-        importance.learn("rgb", RUN * np.arange(len(residual)), residual)
-    importance.renew()
-    return importance
+def _drawn(residual: np.ndarray, evenly: float, steps: int, rays: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of tiles of 32, of which each was looked at often, and the weights of their rays, (steps, rays) each.
+
+    Args:
+        residual: (N,) of each tile.
+    """
+    first_tile, count = torch.tensor([0, len(residual)], dtype=torch.int32), torch.full((len(residual),), TILE, dtype=torch.int32)
+    ends, weight = odds(torch.from_numpy(residual.astype(np.float32)), count, first_tile, evenly)
+    tile = torch.searchsorted(ends, torch.from_numpy(random.integers(0, 1 << 32, steps * rays)), right=True).numpy()
+    pixel = TILE * tile + random.integers(0, TILE, len(tile))
+    return pixel.reshape(steps, rays), weight.numpy()[tile].reshape(steps, rays)
 
 
 def test_rays_that_follow_residuals_do_not_move_the_minimum(row: Row) -> None:
-    """A picture, two of its 200 runs a highlight, explained by one number: the least squared error is at the mean, wherever rays go."""
+    """A picture, two of its 200 tiles a highlight, explained by one number: the least squared error is at the mean, wherever rays go."""
     random = np.random.default_rng(0)
-    seen = np.where(np.arange(200 * RUN) // RUN % 100 == 0, 8.0, 0.3) + 0.05 * random.normal(size=200 * RUN)
+    seen = np.where(np.arange(200 * TILE) // TILE % 100 == 0, 8.0, 0.3) + 0.05 * random.normal(size=200 * TILE)
     gradient = seen - seen.mean()  # of half the squared error, at the minimum: 0 on average
-    importance = _importance(np.abs(gradient).reshape(200, RUN).mean(1), 0.5)
-    pixel, weight = (x.reshape(2000, 400) for x in importance.draw("rgb", 2000 * 400, random))
+    pixel, weight = _drawn(np.abs(gradient).reshape(200, TILE).mean(1), 0.5, 2000, 400, random)
     usual, ours = gradient[pixel].mean(1), (weight * gradient[pixel]).mean(1)
     even = gradient[random.integers(len(seen), size=(2000, 400))].mean(1)
     bias = lambda steps: float(np.abs(steps.mean()) / (steps.std() / len(steps) ** 0.5))
@@ -254,14 +255,14 @@ def test_rays_that_follow_residuals_do_not_move_the_minimum(row: Row) -> None:
 
 
 def test_rays_are_bounded_where_residuals_are_out_of_date(row: Row) -> None:
-    """A run that fitted well until now and does not any more: rays that were seldom drawn must not weigh the more for it."""
+    """A tile that fitted well until now and does not any more: rays that were seldom drawn must not weigh the more for it."""
     random = np.random.default_rng(1)
     known = np.where(np.arange(200) % 100 == 0, 8.0, 0.002)
-    gradient = np.where(np.arange(200 * RUN) // RUN == 50, 1.0, 0.0)
+    gradient = np.where(np.arange(200 * TILE) // TILE == 50, 1.0, 0.0)
     even = gradient[random.integers(len(gradient), size=(2000, 400))].mean(1)
     heaviest, noise = {}, {}
     for evenly in (1e-6, 0.5):
-        pixel, weight = (x.reshape(2000, 400) for x in _importance(known, evenly).draw("rgb", 2000 * 400, random))
+        pixel, weight = _drawn(known, evenly, 2000, 400, random)
         steps = (weight * gradient[pixel]).mean(1)
         assert abs(steps.mean() - gradient.mean()) < 4 * steps.std() / len(steps) ** 0.5
         heaviest[evenly], noise[evenly] = float(weight.max()), float(steps.std() / even.std())

@@ -15,7 +15,9 @@ from analytic import AnalyticField, WrongField, scene_of, sphere
 from page_reader import check, picture_of
 
 from mmsynth.operations.evaluation.evaluate import evaluate
+from mmsynth.operations.output import previews
 from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
+from mmsynth.report.run_pictures import picture_rows
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
@@ -119,6 +121,23 @@ def test_pictures_and_embedded_light_are_those_of_the_field_and_the_frame(tmp_pa
     assert 0.5 * np.percentile(error, 99) < high < 3 * error.max()
     order = np.argsort(error[error < high])
     assert (np.diff(brightness[error < high][order]) >= -1.5).all() and brightness.max() - brightness.min() > 50
+
+
+def test_of_a_large_frame_every_nth_pixel_is_rendered_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = WrongField(sphere())
+    field.wrong = False
+    scene = scene_of(field, tmp_path / "scene")
+    monkeypatch.setattr(previews, "LARGEST", 9)
+    asked: list[Camera] = []
+    render = field.render
+    monkeypatch.setattr(field, "render", lambda camera, *args, **how: asked.append(camera) or render(camera, *args, **how))
+    _, rows = picture_rows(field, scene)  # type: ignore[arg-type]
+    assert len(asked) == 4 and {(camera.width, camera.height) for camera in asked} == {(8, 6)}
+    assert {picture.image.shape[:2] for row in rows for picture in row.each()} == {(6, 8)}
+    # of a sensor without mosaic the frame is what is rendered, pixel for pixel, but for its 16 bits
+    mono = next(row for row in rows if row.title == "mono")
+    (error,) = [picture for picture in mono.each() if picture.caption.startswith("error")]
+    assert float(error.caption.removeprefix("error, mean ")) < 1e-5
 
 
 def test_predicted_modalities_say_so_with_their_deviation(tmp_path: Path) -> None:

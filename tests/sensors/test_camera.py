@@ -11,8 +11,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mmsynth.errors import InputError
+from mmsynth.sensors import camera as cameras
 from mmsynth.sensors import lenses
-from mmsynth.sensors.camera import Camera, Lens, project, project_points, ray_map, round_trip_error, unproject, unproject_points
+from mmsynth.sensors.camera import Camera, Lens, every_nth, project, project_points, ray_map, round_trip_error, unproject, unproject_points
 
 RIG = Camera(160, 120, 171.8, 171.5, 80.1, 58.9, (-0.118, 0.092, 0.0006, -0.0009, 0.01, 0.0))
 RATIONAL = Camera(160, 120, 120.0, 121.0, 80.1, 58.9, (0.2, -0.1, 0.0006, -0.0009, 0.01, 0.4, -0.05, 0.02))
@@ -239,3 +240,23 @@ def test_bad_intrinsics_are_refused() -> None:
         Camera(4, 3, 1.0, 1.0, 0.0, 0.0, (0.1, 0.2, 0.3, 0.4, 0.5), "kannala_brandt")
     with pytest.raises(InputError, match="lens 'omni'"):
         Camera(4, 3, 1.0, 1.0, 0.0, 0.0, (), "omni")  # type: ignore[arg-type]
+
+
+def test_rays_of_a_large_camera_are_those_of_its_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map that is made by bands, the last one cut off; one large camera is kept, and it is not written to."""
+    monkeypatch.setattr(cameras, "_SMALL", 64)
+    camera, other = (Camera(20, 11, 18.0, 18.0, cx, 5.0, (-0.4, 0.05, 0.001, -0.002)) for cx in (9.4, 9.9))
+    directions, valid = ray_map(camera)
+    v, u = np.mgrid[0:11, 0:20]
+    expected, seen = unproject(np.stack([u, v], -1).astype(float), camera)
+    np.testing.assert_allclose(directions, expected, atol=1e-14)
+    np.testing.assert_array_equal(valid, seen)
+    assert ray_map(camera)[0] is directions and not directions.flags.writeable
+    ray_map(other)
+    assert ray_map(camera)[0] is not directions
+
+
+def test_every_nth_photosite_has_the_ray_that_it_had() -> None:
+    for camera in (RIG, FISHEYE):
+        for n in (1, 3, 7):
+            np.testing.assert_allclose(ray_map(every_nth(camera, n))[0], ray_map(camera)[0][::n, ::n], atol=1e-12)

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmsynth.sensors.mosaic import BAYER, channel_map, crop_pattern, demosaic, demosaic_edge_aware, mosaic, mosaic_mask
+from mmsynth.sensors import mosaic as mosaics
+from mmsynth.sensors.mosaic import BAYER, channel_map, channels_of, crop_pattern, demosaic, demosaic_edge_aware, mosaic, mosaic_mask
 
 RGGB = np.array([[0, 1], [1, 2]])
 POL = np.array([[2, 1], [3, 0]])
@@ -124,3 +125,11 @@ def test_gradients(which: int) -> None:
     assert torch.autograd.gradcheck(lambda x: mosaic(x, pattern), image)
     raw = torch.rand(6, 5, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: demosaic(x, pattern), raw)
+
+
+@pytest.mark.parametrize("pattern", [[[0, 1], [1, 2]], [[4, 5, 6], [2, 1, 0], [3, 8, 7]], [[0, 1]]])
+def test_a_frame_demosaicked_by_bands_is_the_frame_demosaicked(pattern: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, tile = np.random.default_rng(0).random((47, 13)), np.array(pattern)
+    whole = demosaic(torch.from_numpy(frame), tile).movedim(0, -1).numpy()
+    monkeypatch.setattr(mosaics, "_BAND", 1)
+    np.testing.assert_allclose(channels_of(frame, tile), whole, atol=1e-14)

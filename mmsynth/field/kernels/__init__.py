@@ -1,16 +1,16 @@
 """The operations that a field is made of: tensors in, tensors out. The back end follows the tensors.
 
 numba for float32 on the CPU (``cpu``), Triton for float32 on a GPU where it runs (``cuda``), torch elsewhere. ``reference``, with
-``shading`` and ``mirroring``, defines every operation; docstrings are there. Each back end has all of them under the same names: its own,
-the reference's, or the reference's made of its own parts. ``parameters`` says what they take, ``constants`` what they agree on.
-README.md says how to add one.
+``shading``, ``mirroring`` and ``drawing``, defines every operation; docstrings are there. Each back end has all of them under the same
+names: its own, the reference's, or the reference's made of its own parts. ``parameters`` says what they take, ``constants`` what they
+agree on. README.md says how to add one.
 """
 
 from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 import torch
@@ -21,17 +21,28 @@ from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
     AdamStep,
+    Cameras,
+    Drawn,
+    Eikonal,
+    Frames,
+    Gains,
     GridTable,
     Hits,
     Lamps,
+    Learned,
+    LightNetwork,
     Measured,
     Mirrors,
+    Modalities,
+    Opacities,
     Rays,
     Samples,
     Sampling,
+    Selection,
     ShadedRays,
     ShaderWeights,
     SurfaceNetwork,
+    View,
 )
 from mmsynth.field.kernels.reference import contract, contracted_velocity
 from mmsynth.field.kernels.shading import intensity, photometric, predict, radiance, rays_of, residual
@@ -41,27 +52,43 @@ __all__ = [
     "SHELL",
     "SOLID",
     "AdamStep",
+    "Cameras",
+    "Drawn",
+    "Eikonal",
+    "Frames",
+    "Gains",
     "GridTable",
     "Hits",
     "Lamps",
+    "Learned",
+    "LightNetwork",
     "Measured",
     "Mirrors",
+    "Modalities",
+    "Opacities",
     "Rays",
     "Reflection",
     "Samples",
     "Sampling",
+    "Selection",
     "ShadedRays",
     "ShaderWeights",
     "SurfaceNetwork",
     "Surroundings",
+    "View",
     "adam",
+    "adam_together",
     "compare",
     "contract",
     "contracted_velocity",
+    "draw",
+    "fused_on_gpu",
     "hash_encode",
     "intensity",
+    "learn",
     "march",
     "mirror",
+    "odds",
     "photometric",
     "predict",
     "radiance",
@@ -85,6 +112,11 @@ def _on_gpu() -> ModuleType:
     if not can:
         print(f"GPU kernels unavailable ({why}): using torch operations", file=sys.stderr, flush=True)
     return cuda if can else reference
+
+
+def fused_on_gpu() -> bool:
+    """Whether Triton serves this machine's GPU."""
+    return _on_gpu() is not reference
 
 
 def _backend(tensor: Tensor) -> ModuleType:
@@ -135,6 +167,49 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
 
 
+def learn(
+    grid: GridTable,
+    network: SurfaceNetwork,
+    appearance: GridTable,
+    states: Tensor,
+    shader: ShaderWeights,
+    light: LightNetwork,
+    far_light: Tensor,
+    rays: Rays,
+    view: View,
+    measured: Measured,
+    gains: Gains,
+    opacities: Opacities,
+    eikonal: Eikonal,
+    sampling: Sampling,
+) -> Learned:
+    """A step's loss, and its gradients, added to ``grad`` of what is learned."""
+    return _backend(rays.origins).learn(
+        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling
+    )
+
+
+def draw(
+    frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
+) -> Drawn:
+    """Random photosites, the rays through them, and what was measured along these."""
+    return _backend(frames.origin).draw(frames, cameras, modalities, selection, rays, key)
+
+
+def odds(residual: Tensor, count: Tensor, first_tile: Tensor, evenly: float) -> tuple[Tensor, Tensor]:
+    """How often each tile of the frames is drawn, and the weights of its rays."""
+    return _backend(residual).odds(residual, count, first_tile, evenly)
+
+
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """One step of Adam, in place."""
     _backend(parameter).adam(parameter, gradient, first, second, step)
+
+
+def adam_together(parts: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, AdamStep]]) -> None:
+    """The same of many tensors, what ``adam`` takes of each."""
+    if all(_backend(part[0]) is cpu for part in parts):
+        cpu.adam_together(parts)
+        return
+    for part in parts:
+        adam(*part)

@@ -22,3 +22,8 @@ HUBER_DELTA = 0.5  # relative residuals above it count linearly
 LEAST_ROUGHNESS = 0.02  # sharper images than any pixel could tell
 REFRACTIVE_INDEX = 1.5  # of what mirrors lamps: glass, plastics, varnish
 LEAST_WEIGHT = 1e-12  # of a ray's sections, by which its features are divided
+
+# of a ray's random numbers, what each decides
+DRAW_TILE, DRAW_PIXEL, DRAW_JITTER = 0, 1, 2
+PURPOSE_STRIDE = 0x9E3779B9  # between their keys
+WORD = 32  # pixels whose bits are one number

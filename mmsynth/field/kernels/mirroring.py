@@ -31,6 +31,7 @@ from torch.nn.functional import normalize, softplus
 
 from mmsynth.field.kernels.constants import LEAST_ROUGHNESS, REFRACTIVE_INDEX
 from mmsynth.field.kernels.parameters import Lamps, Measured, Mirrors
+from mmsynth.field.kernels.shading import rays_of
 
 _AT_NORMAL = ((REFRACTIVE_INDEX - 1.0) / (REFRACTIVE_INDEX + 1.0)) ** 2
 
@@ -139,10 +140,10 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
         mirrors: what R rays meet. behind: (R,), see ``Hits``.
     """
     reflection, rays = reflect(lamps.position, mirrors), len(behind)
-    later, share = torch.nonzero(behind >= 0)[:, 0], mirrors.share[:, None]
+    share = mirrors.share[:, None]
     amount = torch.where(share > 0.0, share * reflection.amount, torch.zeros_like(reflection.amount))  # what is not met has no normal
     bright = len(measured.ray) - len(measured.axes)
-    of_ray = amount[:rays].index_add(0, later, amount[rays:])
+    of_ray = amount[:rays].index_add(0, rays_of(behind, len(amount))[rays:], amount[rays:])
     spectra = lamps.spectrum[:, measured.output].T
     seen = (of_ray[measured.ray[:bright]] * spectra[:bright]).sum(1)
     if not len(measured.axes):

@@ -1,6 +1,7 @@
 """What the operations take, as tuples of tensors and numbers. The back ends hand them on as they are; numba compiles for their types.
 
 Symbols: R rays, M measured numbers, L levels of a grid, T rows of its table, F features per level, H units of a hidden layer.
+Of what is drawn from: N modalities, F frames, C cameras, T tiles of frames, A analysers; whole numbers are int32 unless said otherwise.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class Samples(NamedTuple):
 class Hits(NamedTuple):
     """What R rays meet: a surface each, and where that covers a pixel in part, at silhouettes and thin parts, what is behind it.
 
-    A row is one surface on one ray: the nearest of each ray, in the order of the rays, and then those behind them, H in all.
+    A row is one surface on one ray: the nearest of each ray, in the order of the rays, and then those behind them, H in all; on a GPU H is
+    2 R, and row R + r is of ray r, zeros where nothing is.
 
     Attributes:
         features: (H, F), the mean over the surface. share: (H,), of the light of its ray. distance: (H,), its mean ray
@@ -170,6 +172,73 @@ class Mirrors(NamedTuple):
     share: Tensor
 
 
+class LightNetwork(NamedTuple):
+    """Lamps, and a hidden layer that tells from features how surfaces mirror them; weights (out, in), biases (out,).
+
+    Attributes:
+        second, second_bias: 5 + L outputs: roughness, strength, surroundings, transmitted, polarizing, and the visibility of each of L
+            lamps.
+        position: (L, 3), normalised frame. log_spectrum: (L, outputs of the shader). used: (K,) int64, ascending: the lamps that there
+            are; none: surfaces do not shine, and nothing here is asked.
+    """
+
+    first: Tensor
+    first_bias: Tensor
+    second: Tensor
+    second_bias: Tensor
+    position: Tensor
+    log_spectrum: Tensor
+    used: Tensor
+
+
+class View(NamedTuple):
+    """Of R rays: degrees (R,) int64 of the harmonics of direction that are seen; trains_geometry (R,) bool, see ``ShadedRays``."""
+
+    degrees: Tensor
+    trains_geometry: Tensor
+
+
+class Gains(NamedTuple):
+    """log_gain (frames,): exposures relative to their mean are exp(log_gain - mean); empty: all are 1. frame: (M,) int64 of each number."""
+
+    log_gain: Tensor
+    frame: Tensor
+
+
+class Opacities(NamedTuple):
+    """What is known of the opacity o of R rays: Σ weight (o - target)² + linear o is part of the loss; (R,) each, or all empty."""
+
+    target: Tensor
+    weight: Tensor
+    linear: Tensor
+
+
+class Eikonal(NamedTuple):
+    """Where |∇sdf| = 1 is asked for: at points of all space and, of the surfaces that rays meet, at all if they shine, else at some.
+
+    Attributes:
+        points: (P, 3), frame of the grid. noise: (Q, 3): of Q of the R rays, evenly spaced, how far from the surface they meet they ask,
+            where it does not shine. weight: of the term, a mean over P + Q, or P + R where surfaces shine. epsilon, mirror_epsilon: of the
+            differences, at points and where surfaces shine. shallow: factor, within the unit ball, where the slope is below 1 (not where
+            surfaces shine).
+    """
+
+    points: Tensor
+    noise: Tensor
+    weight: float
+    epsilon: float
+    mirror_epsilon: float
+    shallow: float
+
+
+class Learned(NamedTuple):
+    """Of a step: the loss, a scalar; squared (M,), residuals; samples, a number."""
+
+    loss: Tensor
+    squared: Tensor
+    samples: Tensor
+
+
 class AdamStep(NamedTuple):
     """What a step of Adam is told beside its tensors.
 
@@ -185,3 +254,106 @@ class AdamStep(NamedTuple):
     epsilon: float
     number: int
     sparse: bool = False
+
+
+class Frames(NamedTuple):
+    """The F frames of all modalities, those of one together; what they hold, as it was stored.
+
+    Attributes:
+        start: (F,) int64, the first value, counted in values of its kind. kind: (F,), 0 = uint8, 1 = uint16, 2 = float32.
+        stride: (F,), values of a pixel as stored: those measured, and alpha after them where it is larger by one.
+        camera: (F,). first_tile: (F,), ascending.
+        rotation: (F, 3, 3), origin: (F, 3), camera to world, normalised frame.
+        codes8, codes16, floats: (·,) uint8, uint16, float32: three views of one buffer.
+    """
+
+    start: Tensor
+    kind: Tensor
+    stride: Tensor
+    camera: Tensor
+    first_tile: Tensor
+    rotation: Tensor
+    origin: Tensor
+    codes8: Tensor
+    codes16: Tensor
+    floats: Tensor
+
+
+class Cameras(NamedTuple):
+    """C cameras: the directions of their pixels, on nodes.
+
+    Attributes:
+        width: (C,) [px]. step: (C,), pixels between nodes; 1: nodes are pixels, else there are four at least along each axis.
+        first: (C,) int64, the first node. across, down: (C,), nodes of a row, rows.
+        nodes: (·, 3) unit directions in the camera's axes, of pixel (column i step, row j step) at first + j across + i.
+    """
+
+    width: Tensor
+    step: Tensor
+    first: Tensor
+    across: Tensor
+    down: Tensor
+    nodes: Tensor
+
+
+class Modalities(NamedTuple):
+    """N modalities, in the order of batches: polarization last.
+
+    Attributes:
+        first_frame, first_tile: (N + 1,). tile_width, tile_height: (N,) [px], powers of two, of 32 pixels at least.
+        values: (N,), measured along each ray: one under a mosaic, else a number per channel. output: (N,), of the shader, the first.
+        pattern_first: (N,), of its mosaic in ``pattern``, -1 = none. pattern_height, pattern_width: (N,). pattern: (·,), row by row.
+        level, saturation: (N,), see ``Measured``. opaque: (N,), alpha where none is stored, NaN = no opacity to match.
+        analyser_first: (N,), of its analysers in ``analysers``, -1 = no polarization. analysers: (A, 2), cos and sin of their angles.
+    """
+
+    first_frame: Tensor
+    first_tile: Tensor
+    tile_width: Tensor
+    tile_height: Tensor
+    values: Tensor
+    output: Tensor
+    pattern_first: Tensor
+    pattern_height: Tensor
+    pattern_width: Tensor
+    pattern: Tensor
+    level: Tensor
+    saturation: Tensor
+    opaque: Tensor
+    analyser_first: Tensor
+    analysers: Tensor
+
+
+class Selection(NamedTuple):
+    """Which pixels are drawn, and how often: T tiles, those of a frame together, row by row.
+
+    Attributes:
+        ends: (T,) int64, of 2³² random numbers, up to which one draws the tile; of each modality for itself, 2³² its last.
+        weight: (T,), of a ray, which makes up for how often its tile is drawn. pixels: (T,), of the tile, how many may be drawn.
+        first_word: (N,) int64, of the modality in ``words``, -1 = all pixels may be drawn.
+        words: (·,) int32, tile after tile: of each pixel, row by row, a bit, lowest first: whether it may be drawn.
+    """
+
+    ends: Tensor
+    weight: Tensor
+    pixels: Tensor
+    first_word: Tensor
+    words: Tensor
+
+
+class Drawn(NamedTuple):
+    """R rays and M numbers measured along them, modality after modality; the last P numbers are of polarization.
+
+    Attributes:
+        origins, directions: (R, 3), normalised frame. jitter: (R,) in [0, 1). alpha: (R,), opacity, NaN = none to match.
+        ray_weight: (R,), of the tile. tile: (R,) int64. frame: (M,) int64, of each number, among all. measured: see ``Measured``.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    jitter: Tensor
+    alpha: Tensor
+    ray_weight: Tensor
+    tile: Tensor
+    frame: Tensor
+    measured: Measured

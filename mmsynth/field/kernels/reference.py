@@ -26,7 +26,9 @@ from mmsynth.field.kernels.constants import (
     SOFT_SURFACE,
     SOLID,
 )
-from mmsynth.field.kernels.mirroring import mirror as mirror  # this and ``shading`` are of the reference, too
+from mmsynth.field.kernels.drawing import draw as draw  # this, ``mirroring`` and ``shading`` are of the reference, too
+from mmsynth.field.kernels.drawing import odds as odds
+from mmsynth.field.kernels.mirroring import mirror as mirror
 from mmsynth.field.kernels.parameters import (
     AdamStep,
     GridTable,
@@ -40,7 +42,6 @@ from mmsynth.field.kernels.shading import compare as compare
 from mmsynth.field.kernels.shading import shade as shade
 
 Encoding = Callable[[Tensor, Tensor, Tensor, Tensor, int], Tensor]  # see ``hash_encode``
-Weighing = Callable[[Tensor, float, Tensor], tuple[Tensor, Tensor]]  # see ``section_weights``
 
 
 def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
@@ -80,10 +81,10 @@ def encode(positions: Tensor, grid: GridTable, hash_encode: Encoding = hash_enco
     return hash_encode(unit, grid.table, grid.resolutions, grid.offsets, grid.active)
 
 
-def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork, hash_encode: Encoding = hash_encode) -> Tensor:
+def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
     """Signed distance, positive outside: (N, 3) in the frame of the grid → (N,). min(|x| - r₀, r₁ - |x|) + network(features, x)."""
     ones = torch.ones_like(positions[:, :1])
-    hidden = torch.relu(torch.cat([positions, ones, encode(positions, grid, hash_encode)], -1) @ network.hidden.T)
+    hidden = torch.relu(torch.cat([positions, ones, encode(positions, grid)], -1) @ network.hidden.T)
     norm = torch.linalg.vector_norm(positions, dim=-1)
     spheres = torch.minimum(norm - network.inner_radius, network.outer_radius - norm)
     return hidden @ network.output[:-1] + network.output[-1] + spheres
@@ -244,10 +245,7 @@ def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, state
     return composite(sdf, appearance, rays, samples, sampling)
 
 
-def composite(
-    sdf: Callable[[Tensor], Tensor], appearance: GridTable, rays: Rays, samples: Samples, sampling: Sampling,
-    hash_encode: Encoding = hash_encode, section_weights: Weighing = section_weights,
-) -> Hits:  # fmt: skip
+def composite(sdf: Callable[[Tensor], Tensor], appearance: GridTable, rays: Rays, samples: Samples, sampling: Sampling) -> Hits:
     """Evaluate, weigh and composite the samples of R rays.
 
     Appearance is looked up where each section crosses the surface, once per section that matters; it is shaded once per surface that a ray
@@ -274,7 +272,7 @@ def composite(
     at, w = ray[chosen], weights[chosen]
     where = torch.lerp(t[chosen], t[following], crossing[chosen])
     crossings = position(at, where)
-    encoded = encode(crossings, appearance, hash_encode)
+    encoded = encode(crossings, appearance)
     second = _second_surface(crossings.detach(), at, chosen, LAYER_GAP / sampling.sharpness, count, len(t))
     behind = torch.full_like(second, -1)
     met_twice = torch.nonzero(second < len(t))[:, 0]

@@ -133,7 +133,7 @@ def gather(field: Field, scene: Scene, source: str, target: str, lights: dict[st
         )
         used = np.broadcast_to(said.there.valid.reshape(said.there.valid.shape + (1,) * (real.ndim - 2)), real.shape)
         used = used & (real < sensor.saturation)
-        photosites = {name: _photosites(light, sensor)[used] for name, light in said.light.items()}
+        photosites = {name: _photosites(light.astype(np.float64), sensor)[used] for name, light in said.light.items()}
         left = real[used] - photosites["field"]
         apart = np.stack([photosites[name] - photosites["field"] for name in names])
         grams.append(apart @ apart.T / max(len(left), 1))

@@ -57,9 +57,9 @@ def convert_files(
 
     * ``NAME.npz``, ``.exr`` or ``.tiff`` (see ``records``): data (H, W, C) float32, opacity, valid, confidence, guided; polarization also
       stokes (H, W, 3) in this camera's x-axis frame; with ``as_sensor`` and a mosaic also raw (H, W), what its photosites measure;
-    * ``NAME.png``: 16-bit preview, tone-mapped with one exposure for all views; for polarization S0, and ``NAME_dolp.png`` (grey)
-      and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``); ``NAME_confidence.png``. Of a
-      modality that a prior predicts all of them are ``NAME_predicted...``, and the arrays have a deviation (H, W, C);
+    * ``NAME.png``: 16-bit preview, at most 800 pixels a side, tone-mapped with one exposure for all views; for polarization S0, and
+      ``NAME_dolp.png`` (grey) and ``NAME_aolp.png`` (hue = AoLP, value = DoLP, see ``previews.preview_aolp``); ``NAME_confidence.png``.
+      Of a modality that a prior predicts all of them are ``NAME_predicted...``, and the arrays have a deviation (H, W, C);
     * ``NAME.json``: camera, method, exposure, conventions, hash; written last, so a view with a sidecar is complete.
 
     Args:
@@ -222,7 +222,7 @@ def _write_pictures(folder: Path, name: str, sensor: Sensor, made: Converted, ex
         pictures[f"{shown}_dolp.png"] = previews.preview_dolp(made.stokes)
         pictures[f"{shown}_aolp.png"] = previews.preview_aolp(made.stokes)
     for file, picture in pictures.items():
-        write_png16(folder / file, picture)
+        write_png16(folder / file, previews.reduced(picture))
     return [folder / file for file in pictures]
 
 

@@ -16,18 +16,21 @@ same renderings and shrunk to the whole picture's (``guided``).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
+from mmsynth.field.picture import bands
 from mmsynth.scene.scene import Sensor
-from mmsynth.sensors.filters import box_mean, gaussian_mean
+from mmsynth.sensors.filters import box_mean, by_bands, gaussian_mean
 from mmsynth.sensors.mosaic import channels_of, photosites_of
 
 # of a photosite whose sensor nobody calibrated: shot noise of 10,000 electrons at full scale, and a floor
 SHOT, FLOOR = 1e-4, 1e-6
 _WINDOW = 0.5  # px, standard deviation: a photosite and its direct neighbours
 _COLOUR_WINDOW = 1.5
+_POWER_WINDOW = 9
 _MAP_RADIUS, _MAP_RIDGE = 4, 1e-3
 _PLAIN = 0.005  # variance of logarithms below which a window is plain
 _DARK = 0.02
@@ -58,11 +61,11 @@ def guide(raw: np.ndarray, rendered: np.ndarray, sensor: Sensor, valid: np.ndarr
     Args:
         raw: (H, W) of a mosaic, else (H, W, C), linear. rendered: (H, W, C). valid: (H, W) bool, where the lens has a ray.
     """
-    clear = np.where(valid[..., None], rendered, 0.0).astype(np.float64)
     if sensor.mosaic is None:
-        seen, expected, used = raw.astype(np.float64), clear, np.broadcast_to(valid[..., None], clear.shape)
+        seen, clear, used = raw.astype(np.float64), rendered, np.broadcast_to(valid[..., None], rendered.shape)
     else:
-        seen, expected, used = raw[..., None].astype(np.float64), photosites_of(clear, sensor.mosaic)[..., None], valid[..., None]
+        seen, clear, used = raw[..., None].astype(np.float64), photosites_of(rendered, sensor.mosaic)[..., None], valid[..., None]
+    expected = np.where(valid[..., None], clear, 0.0).astype(np.float64)
     # a clipped value says "at least": nothing where the rendering says as much
     used = used & (seen < sensor.saturation)
     variance = SHOT * np.maximum(expected, 0.0) + FLOOR
@@ -114,7 +117,17 @@ def _prior(difference: np.ndarray, expected: np.ndarray, variance: np.ndarray, u
 def _residual_colour(
     left: np.ndarray, expected: np.ndarray, variance: np.ndarray, used: np.ndarray, sensor: Sensor, gain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The residual colour at every pixel (H, W, C), and where it is too large to be an error of the field."""
+    """The residual colour at every pixel (H, W, C) float32, and where it is too large to be an error of the field."""
+    tile = (1, 1) if sensor.mosaic is None else sensor.mosaic.shape
+    reach = max(tile) + 2 * int(4.0 * _COLOUR_WINDOW + 0.5) + _POWER_WINDOW // 2
+    judged = by_bands(functools.partial(_colour_of, sensor), (left, expected, variance, used, gain), reach, tile[0])
+    return judged[..., :-1], judged[..., -1] > 0.5
+
+
+def _colour_of(
+    sensor: Sensor, left: np.ndarray, expected: np.ndarray, variance: np.ndarray, used: np.ndarray, gain: np.ndarray
+) -> np.ndarray:
+    """(H, W, C + 1) float32: the residual colour, and 1 where it is too large."""
     known = np.where(used, left, 0.0)
     full = channels_of(known if sensor.mosaic is None else known[..., 0], sensor.mosaic)
     noise = np.broadcast_to(variance, full.shape)
@@ -123,31 +136,37 @@ def _residual_colour(
     # of independent values a window of σ leaves 1 / (4 π σ²) of the variance; a mosaic has fewer of each channel
     tile = 1 if sensor.mosaic is None else sensor.mosaic.size
     noise_left = smooth(noise) * min(1.0, tile / (4.0 * np.pi * _COLOUR_WINDOW**2))
-    power = box_mean(low**2, 9)
+    power = box_mean(low**2, _POWER_WINDOW)
     colour = low * np.clip(1.0 - noise_left / np.maximum(power, 1e-12), 0.0, 1.0)
     if full.shape[-1] == 1:
         colour = np.zeros_like(colour)  # one channel has no colour
     level = smooth(np.maximum(expected, 0.0).mean(-1, keepdims=True))[..., 0] + 0.02
     far = np.abs(np.log(np.clip(gain, 1e-3, 1e3))) > 3.0 * np.log1p(_UNEXPLAINED)
-    return colour, far | (np.abs(low).max(-1) > _UNEXPLAINED * level)
+    return np.dstack([colour, far | (np.abs(low).max(-1) > _UNEXPLAINED * level)]).astype(np.float32)
 
 
 def gain_exponent(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """β(x), (H, W, K) in [0, 1]: by how much the logarithm of each target channel varies with that of the source's mean, around each
-    pixel, in the field's own renderings; 1 where nothing varies, and light is what could.
+    """β(x), (H, W, K) float32 in [0, 1]: by how much the logarithm of each target channel varies with that of the source's mean, around
+    each pixel, in the field's own renderings; 1 where nothing varies, and light is what could.
 
     Args:
         source: (H, W, C). target: (H, W, K).
     """
+    return by_bands(_exponent, (source, target, valid), _MAP_RADIUS)
+
+
+def _exponent(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:
     log = lambda a: np.log(np.maximum(np.where(valid[..., None], a, 0.0), 0.0).astype(np.float64) + _DARK)
     x, y = log(source.mean(-1, keepdims=True)), log(target)
     mean = lambda a: box_mean(a, 2 * _MAP_RADIUS + 1)
     mx, my = mean(x), mean(y)
-    return np.asarray(np.clip((mean(x * y) - mx * my + _PLAIN) / (mean(x * x) - mx * mx + _PLAIN), 0.0, 1.0))
+    share = (mean(x * y) - mx * my + _PLAIN) / (mean(x * x) - mx * mx + _PLAIN)
+    return np.clip(share, 0.0, 1.0).astype(np.float32)
 
 
-def linear_map(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """(H, W, K, C): how the target's channels vary with the source's around each pixel, in the field's own renderings.
+def mapped_colour(source: np.ndarray, target: np.ndarray, valid: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """A source's residual colour (H, W, C) in the target's channels, (H, W, K) float32: by how these vary with the source's around each
+    pixel, in the field's own renderings.
 
     Ridge regression in windows of 9 x 9 pixels, shrunk to the map of the whole picture where a window is plain (the guided filters of
     OpenCV and kornia shrink it to 0, and keep the map to themselves).
@@ -155,12 +174,21 @@ def linear_map(source: np.ndarray, target: np.ndarray, valid: np.ndarray) -> np.
     Args:
         source: (H, W, C). target: (H, W, K).
     """
-    x, y = (np.where(valid[..., None], a, 0.0).astype(np.float64) for a in (source, target))
-    flat_x, flat_y = x[valid], y[valid]
-    ridge = _MAP_RIDGE * np.eye(x.shape[-1])
-    whole = np.linalg.solve(flat_x.T @ flat_x + ridge * len(flat_x), flat_x.T @ flat_y).T
-    mean = lambda a: box_mean(a, 2 * _MAP_RADIUS + 1)
-    mx, my = mean(x), mean(y)
-    of_x = mean(x[..., :, None] * x[..., None, :]) - mx[..., :, None] * mx[..., None, :]
-    of_both = mean(y[..., :, None] * x[..., None, :]) - my[..., :, None] * mx[..., None, :]
-    return np.linalg.solve(of_x + ridge, np.swapaxes(of_both + _MAP_RIDGE * whole, -1, -2)).swapaxes(-1, -2)
+    xx, yx, count = 0.0, 0.0, int(valid.sum())
+    for rows in bands(valid.shape):
+        x, y = (a[rows][valid[rows]].astype(np.float64) for a in (source, target))
+        xx, yx = xx + x.T @ x, yx + y.T @ x
+    ridge = _MAP_RIDGE * np.eye(source.shape[-1])
+    whole = np.linalg.solve(xx + ridge * count, np.transpose(yx)).T
+
+    def mapped(source: np.ndarray, target: np.ndarray, valid: np.ndarray, colour: np.ndarray) -> np.ndarray:
+        x, y = (np.where(valid[..., None], a, 0.0).astype(np.float64) for a in (source, target))
+        mean = lambda a: box_mean(a, 2 * _MAP_RADIUS + 1)
+        mx, my = mean(x), mean(y)
+        of_x = mean(x[..., :, None] * x[..., None, :]) - mx[..., :, None] * mx[..., None, :]
+        of_both = mean(y[..., :, None] * x[..., None, :]) - my[..., :, None] * mx[..., None, :]
+        # the map (K, C) of each pixel is (of_both + ridge whole) (of_x + ridge)⁻¹, and of_x is symmetric
+        turned = np.linalg.solve(of_x + ridge, colour[..., None].astype(np.float64))
+        return ((of_both + _MAP_RIDGE * whole) @ turned)[..., 0].astype(np.float32)
+
+    return by_bands(mapped, (source, target, valid, colour), _MAP_RADIUS)

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from mmsynth.errors import InputError
-from mmsynth.operations.conversion.guidance import Guide, gain_exponent, guide, linear_map
+from mmsynth.operations.conversion.guidance import Guide, gain_exponent, guide, mapped_colour
 from mmsynth.operations.conversion.warping import warped
 from mmsynth.operations.conversion.windows import WINDOW, opened
 from mmsynth.operations.output.progress import RaysDone
@@ -73,7 +73,7 @@ class Predictions:
     """On the target's pixels (H, W).
 
     Attributes:
-        there: the field's rendering. light: per method (H, W, K), of a polarization target Stokes (H, W, 3); float64, NaN where the lens
+        there: the field's rendering. light: per method (H, W, K), of a polarization target Stokes (H, W, 3); float32, NaN where the lens
             has no ray. told: per method, where it has a say; of ``field`` where corrections would have one.
         gain_sd: of the gain. unexplained: where the frame shows what the field does not have.
     """
@@ -92,14 +92,14 @@ def in_one_place(a: PosedCamera, b: PosedCamera) -> bool:
 
 def light_of(seen: Rendering, sensor: Sensor) -> np.ndarray:
     """(H, W, K) channels, of polarization Stokes (H, W, 3)."""
-    return (seen.stokes[sensor.name] if sensor.is_polarization else seen.channels[sensor.name]).astype(np.float64)
+    return seen.stokes[sensor.name] if sensor.is_polarization else seen.channels[sensor.name]
 
 
 def as_light(values: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Channels (..., K) → of polarization Stokes vectors (..., 3)."""
     if sensor.polarizer_angles_deg is None:
         return values
-    return intensities_to_stokes(torch.from_numpy(np.asarray(values, np.float64)), sensor.polarizer_angles_deg).numpy()
+    return intensities_to_stokes(torch.from_numpy(np.asarray(values, np.float32)), sensor.polarizer_angles_deg).numpy()
 
 
 def _physical(light: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -133,7 +133,7 @@ def learn_training(field: Field, scene: Scene, source: str, target: str) -> Trai
         seen = field.render(camera, field.pose_of(frame), list(dict.fromkeys((source, target))), geometry=False)
         x = seen.channels[source][seen.valid].astype(np.float64)
         xs.append(np.concatenate([x, np.ones((len(x), 1))], 1))
-        ys.append(light_of(seen, field.sensors[target])[seen.valid])
+        ys.append(light_of(seen, field.sensors[target])[seen.valid].astype(np.float64))
     x, y = np.concatenate(xs), np.concatenate(ys)
     matrix = np.linalg.solve(x.T @ x + 1e-6 * len(x) * np.eye(x.shape[1]), x.T @ y)
     return Training(matrix, scene.frames_of(target, scene.split.train))
@@ -179,16 +179,15 @@ def predict(
     sensor, seen, guidance, view = field.sensors[target], compared.seen, compared.guidance, compared.view
     of_light = sensor.is_polarization  # one gain for all of a Stokes vector
     shown = seen.channels[target].mean(-1, keepdims=True) if of_light else seen.channels[target]
-    gain = np.maximum(guidance.gain, 1e-3)[..., None] ** gain_exponent(seen.channels[source], shown, seen.valid)
-    colour = np.zeros((*seen.valid.shape, light_of(seen, sensor).shape[-1]))
+    gain = np.maximum(guidance.gain, 1e-3).astype(np.float32)[..., None] ** gain_exponent(seen.channels[source], shown, seen.valid)
+    colour = np.zeros((*seen.valid.shape, light_of(seen, sensor).shape[-1]), np.float32)
     if "guided" in methods and not of_light:
-        local_map = linear_map(seen.channels[source], seen.channels[target], seen.valid)
-        colour = (local_map @ guidance.residual_colour[..., None])[..., 0]
+        colour = mapped_colour(seen.channels[source], seen.channels[target], seen.valid, guidance.residual_colour)
     mapped = np.zeros_like(colour)
     if "linear" in methods:
         assert training is not None
-        channels = channels_of(compared.raw, field.sensors[source].mosaic).astype(np.float64)
-        mapped = np.concatenate([channels, np.ones((*channels.shape[:2], 1))], -1) @ training.matrix
+        matrix = training.matrix.astype(np.float32)
+        mapped = channels_of(compared.raw, field.sensors[source].mosaic).astype(np.float32) @ matrix[:-1] + matrix[-1]
     there, told, gain_sd, unexplained = seen, seen.valid & ~guidance.unexplained, guidance.gain_sd, guidance.unexplained
     covered = seen.valid
     if seen_by is not None and not in_one_place(view, seen_by):

@@ -27,15 +27,17 @@ averaged per view in dB):
   ``normal_median_deg`` where both have a surface,
   ``hit_rate``: the share of true surface pixels that hit one; ``chamfer_visible``: mean distance from the field's surface points to
   the nearest true one and back, averaged, between the points that the test views see (a ground-truth mesh also has undersides
-  that no camera saw). Only for scenes in metres, as the truth is.
+  that no camera saw; of a picture of more than 262,144 pixels, points of every n-th row and column). Only for scenes in metres, as the
+  truth is.
 
 What is undefined (no such truth, no pixel) is left out; there is no NaN in the result.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,6 +45,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from mmsynth.errors import InputError
+from mmsynth.field.picture import Rendering, bands
 from mmsynth.operations.evaluation.parts import PARTS, parts_of
 from mmsynth.operations.evaluation.perceptual import LARGE_ENOUGH, Distance, find_lpips, lpips_of_channels
 from mmsynth.operations.output.progress import Counter, Progress
@@ -50,15 +53,15 @@ from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, MaskMeaning, Scene, Sensor
-from mmsynth.sensors.camera import depth_along_rays, surface_points
+from mmsynth.sensors.camera import unproject
 from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim, ssim_of_channels
 from mmsynth.sensors.mosaic import channels_of, photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
-    from mmsynth.field.picture import Rendering
 
+_POINTS = 1 << 18  # pixels of a picture whose points are compared
 _FOREGROUND_SOURCES = ("masks", "gt", "opacity")
 
 
@@ -185,9 +188,8 @@ def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
     if "depth_z" in shape and exam.metric:  # the truth is in metres
         _score_geometry(exam, rendering, shape, where)
         surface = where & rendering.valid
-        seen = lambda depth_z: _seen_points(exam.field, frame, depth_z)
-        exam.points.append(seen(rendering.depth_z)[surface & np.isfinite(rendering.depth_z)])
-        exam.true_points.append(seen(shape["depth_z"])[surface & (shape["depth_z"] > 0)])
+        exam.points.append(_seen_points(exam.field, frame, rendering.depth_z, surface & np.isfinite(rendering.depth_z)))
+        exam.true_points.append(_seen_points(exam.field, frame, shape["depth_z"], surface & (shape["depth_z"] > 0)))
 
 
 def _components(sensor: Sensor) -> int:
@@ -202,11 +204,10 @@ class _Mean:
         self.total = self.weight = 0.0
 
     def add(self, values: np.ndarray, weights: np.ndarray | None = None) -> None:
-        values = np.asarray(values, dtype=np.float64)
-        w = np.ones_like(values) if weights is None else np.asarray(weights, dtype=np.float64)
-        good = np.isfinite(values) & np.isfinite(w)
-        self.total += float((values[good] * w[good]).sum())
-        self.weight += float(w[good].sum())
+        good = np.isfinite(values) if weights is None else np.isfinite(values) & np.isfinite(weights)
+        known = values[good]
+        self.total += float((known if weights is None else known * weights[good].astype(np.float64)).sum(dtype=np.float64))
+        self.weight += float(good.sum() if weights is None else weights[good].sum(dtype=np.float64))
 
     @property
     def value(self) -> float | None:
@@ -259,7 +260,7 @@ def _score_raw(
 ) -> None:
     """Against the frame as the sensor recorded it."""
     measured, alpha = load_frame(sensor, frame)
-    channels = np.clip(np.nan_to_num(rendering.channels[sensor.name]), 0.0, 1.0)
+    channels = rendering.channels[sensor.name]
     mask, valid = read_mask(frame), rendering.valid
     if alpha is not None:
         # what is transparent was never seen
@@ -268,7 +269,7 @@ def _score_raw(
         measured = measured * (mask if measured.ndim == 2 else mask[..., None])
     if mask is not None and masks == "ignore":
         valid = valid & mask
-    predicted = channels if sensor.mosaic is None else photosites_of(channels, sensor.mosaic)
+    predicted = np.clip(np.nan_to_num(channels if sensor.mosaic is None else photosites_of(channels, sensor.mosaic)), 0.0, 1.0)
     squared = (predicted - measured) ** 2
     if mask is None and alpha is not None:
         mask = alpha > 0.5
@@ -296,38 +297,49 @@ def _decibels(squared: np.ndarray) -> np.ndarray:
 
 def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """All channels against noise-free light; truth (H, W, C), of a polarization sensor Stokes (H, W, 3)."""
-    if sensor.polarizer_angles_deg is not None:
-        truth = stokes_to_intensities(torch.from_numpy(truth), sensor.polarizer_angles_deg).numpy()
-    difference = np.clip(rendering.channels[sensor.name], 0.0, 1.0) - np.clip(truth, 0.0, 1.0)
-    scores.add(key, difference[where & rendering.valid] ** 2)
+    for seen, light, here in _by_bands(rendering, truth, where):
+        difference = np.clip(seen.channels[sensor.name], 0.0, 1.0) - np.clip(_channels(light, sensor), 0.0, 1.0)
+        scores.add(key, difference[here] ** 2)
+
+
+def _by_bands(rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> Iterator[tuple[Rendering, np.ndarray, np.ndarray]]:
+    """Rendering, truth and the pixels in question that have a ray, some rows at a time: all of a full-size picture takes gigabytes."""
+    for rows in bands(where.shape):
+        part = rendering.rows(rows)
+        yield part, truth[rows], where[rows] & part.valid
+
+
+def _channels(light: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """(H, W, C) of truth, which is (H, W, 3) Stokes vectors of a polarization sensor."""
+    if sensor.polarizer_angles_deg is None:
+        return light
+    return stokes_to_intensities(torch.from_numpy(light), sensor.polarizer_angles_deg).numpy()
 
 
 def _score_prediction(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """What is asked of a modality that was not measured: how good it is but for its gain, and whether it knows how good it is."""
-    seen = where & rendering.valid
-    if sensor.polarizer_angles_deg is not None:
-        truth = stokes_to_intensities(torch.from_numpy(truth), sensor.polarizer_angles_deg).numpy()
-    ours, real = (np.clip(v[seen], 0.0, 1.0).astype(np.float64) for v in (rendering.channels[sensor.name], truth))
-    for key, values in (("ours_ours", ours * ours), ("ours_true", ours * real), ("true_true", real * real)):
-        scores.add(f"gain/{key}", values)
-    error = np.abs(rendering.channels[sensor.name][seen] - truth[seen])
-    scores.add("within_2sd", error < 2.0 * rendering.deviation[sensor.name][seen])
+    for seen, light, here in _by_bands(rendering, truth, where):
+        values, real_values = seen.channels[sensor.name][here], _channels(light, sensor)[here]
+        ours, real = (np.clip(v, 0.0, 1.0).astype(np.float64) for v in (values, real_values))
+        for key, products in (("ours_ours", ours * ours), ("ours_true", ours * real), ("true_true", real * real)):
+            scores.add(f"gain/{key}", products)
+        scores.add("within_2sd", np.abs(values - real_values) < 2.0 * seen.deviation[sensor.name][here])
 
 
 def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """Errors that PSNR does not show: the shape of the spectrum, the polarization."""
-    where = where & rendering.valid
-    if sensor.is_polarization:
-        ours, real = (torch.from_numpy(s[where].astype(np.float64)) for s in (rendering.stokes[sensor.name], truth))
-        scores.add("stokes_rmse", ((ours - real) ** 2).numpy())
-        scores.add("dolp_mae", (degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)).abs().numpy())
-        scores.add("s1_s2_rmse", ((ours - real)[:, 1:] ** 2).numpy())
-        scores.add("s1_s2_unpolarized_rmse", (real[:, 1:] ** 2).numpy())
-        scores.add("dolp_rmse", ((degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)) ** 2).numpy())
-        error = aolp_difference(angle_of_linear_polarization(ours), angle_of_linear_polarization(real)).abs()
-        scores.add("aolp_mae", error.numpy(), real[:, 1:].norm(dim=1).numpy())
-    elif sensor.channel_count > 3:
-        scores.add("sam", spectral_angle_deg(rendering.channels[sensor.name][where], truth[where]))
+    for seen, light, here in _by_bands(rendering, truth, where):
+        if sensor.is_polarization:
+            ours, real = (torch.from_numpy(s[here].astype(np.float64)) for s in (seen.stokes[sensor.name], light))
+            scores.add("stokes_rmse", ((ours - real) ** 2).numpy())
+            scores.add("dolp_mae", (degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)).abs().numpy())
+            scores.add("s1_s2_rmse", ((ours - real)[:, 1:] ** 2).numpy())
+            scores.add("s1_s2_unpolarized_rmse", (real[:, 1:] ** 2).numpy())
+            scores.add("dolp_rmse", ((degree_of_linear_polarization(ours) - degree_of_linear_polarization(real)) ** 2).numpy())
+            error = aolp_difference(angle_of_linear_polarization(ours), angle_of_linear_polarization(real)).abs()
+            scores.add("aolp_mae", error.numpy(), real[:, 1:].norm(dim=1).numpy())
+        elif sensor.channel_count > 3:
+            scores.add("sam", spectral_angle_deg(seen.channels[sensor.name][here], light[here]))
 
 
 def _score_geometry(exam: _Exam, rendering: Rendering, truth: dict[str, np.ndarray], region: np.ndarray) -> None:
@@ -349,8 +361,15 @@ def _geometry(exam: _Exam) -> dict[str, float]:
     return out | ({"normal_mae_deg": float(errors.mean()), "normal_median_deg": float(np.median(errors))} if len(errors) else {})
 
 
-def _seen_points(field: Field, frame: Frame, depth_z: np.ndarray) -> np.ndarray:
-    return surface_points(frame.camera, field.pose_of(frame), depth_along_rays(frame.camera, depth_z))
+def _seen_points(field: Field, frame: Frame, depth_z: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(N, 3) world points that pixels ``where`` see; of a large picture, those of every n-th row and column."""
+    step = math.ceil(math.sqrt(max(1.0, depth_z.size / _POINTS)))
+    v, u = np.mgrid[0 : depth_z.shape[0] : step, 0 : depth_z.shape[1] : step]
+    pixels = np.stack([u, v], -1)[where[::step, ::step]].astype(np.float64)
+    rays, _ = unproject(pixels, frame.camera)
+    pose, depth = field.pose_of(frame), depth_z[::step, ::step][where[::step, ::step]].astype(np.float64)
+    forward = np.where(rays[:, 2] > 0, rays[:, 2], np.nan)
+    return pose[:3, 3] + rays @ pose[:3, :3].T * (depth / forward)[:, None]
 
 
 def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> dict[str, float]:

@@ -14,6 +14,8 @@ from mmsynth.scene.preview_colours import PreviewColours
 from mmsynth.scene.scene import Sensor
 from mmsynth.sensors.polarization import angle_of_linear_polarization, degree_of_linear_polarization
 
+LARGEST = 800
+"""Pixels in a row or column of a preview: more is not looked at, and to make it of a full-size frame takes minutes."""
 # a display's red, green and blue as bumps over the spectrum: centre and width in nm; enough to recognise a scene, no colorimetry
 _PRIMARIES_NM = ((610.0, 40.0), (545.0, 35.0), (455.0, 30.0))
 
@@ -113,6 +115,15 @@ def preview_normal(normal: np.ndarray) -> np.ndarray:
     """World normals (H, W, 3), NaN = no hit → (H, W, 3) uint8: x, y, z from -1..1 to red, green, blue; no hit black."""
     hit = np.isfinite(normal).all(-1, keepdims=True)
     return np.where(hit, to_uint8(0.5 * (normal + 1.0)), 0).astype(np.uint8)
+
+
+def reduced(image: np.ndarray, side: int = LARGEST) -> np.ndarray:
+    """A picture (H, W) or (H, W, 3) with at most ``side`` pixels in a row or column, by means over areas; smaller ones as they are."""
+    factor = side / max(image.shape[:2])
+    if factor >= 1.0:
+        return image
+    size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def as_rgb(image: np.ndarray) -> np.ndarray:

@@ -38,7 +38,14 @@ def partition_of_environment() -> WorkPartition:
 
 
 def local_device(device: str) -> str:
-    """ "cuda" → the GPU of this process (torchrun's LOCAL_RANK, modulo how many there are); anything else as it is."""
+    """ "cuda" → the GPU of this process (torchrun's LOCAL_RANK, modulo how many there are); anything else as it is.
+
+    Raises:
+        InputError: LOCAL_RANK is no whole number.
+    """
     if device != "cuda":
         return device
-    return f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % torch.cuda.device_count()}"
+    rank = os.environ.get("LOCAL_RANK", "0")
+    if not rank.isdecimal():
+        raise InputError(f"environment: LOCAL_RANK is {rank!r}, expected a whole number.")
+    return f"cuda:{int(rank) % torch.cuda.device_count()}"

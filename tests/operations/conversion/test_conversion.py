@@ -14,11 +14,12 @@ from analytic import MONO, MS, POL, RGB, AnalyticField, WrongField, ring_pose, s
 import mmsynth
 from mmsynth.errors import InputError
 from mmsynth.operations.conversion.files import convert_files
-from mmsynth.operations.conversion.guidance import guide, linear_map
+from mmsynth.operations.conversion.guidance import gain_exponent, guide, mapped_colour
 from mmsynth.operations.conversion.methods import Converted, choose, convert_frame
 from mmsynth.scene.scene import PosedCamera, Sensor
+from mmsynth.sensors import filters
 from mmsynth.sensors.camera import Camera
-from mmsynth.sensors.mosaic import mosaic
+from mmsynth.sensors.mosaic import mosaic, photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, degree_of_linear_polarization
 
 CAMERA = Camera(96, 72, 100.0, 100.0, 47.3, 35.6, (-0.1, 0.05, 0.001, -0.002))
@@ -156,16 +157,39 @@ def _rays(camera: Camera) -> np.ndarray:
     return ray_map(camera)[0]
 
 
-def test_a_linear_map_is_found() -> None:
+def test_a_residual_colour_goes_through_the_linear_map_that_renderings_show() -> None:
     random = np.random.default_rng(0)
     x = random.random((40, 50, 3))
     matrix = random.normal(size=(5, 3))
     valid = np.ones((40, 50), bool)
     valid[:3] = False
-    found = linear_map(x, x @ matrix.T + 0.3, valid)
-    np.testing.assert_allclose(found[12:], np.broadcast_to(matrix, (28, 50, 5, 3)), atol=0.06)
-    plain = linear_map(np.full((30, 30, 1), 0.5), np.full((30, 30, 1), 0.25), np.ones((30, 30), bool))
+    for colour in np.eye(3):  # each channel alone: a column of the map
+        found = mapped_colour(x, x @ matrix.T + 0.3, valid, np.broadcast_to(colour, x.shape))
+        np.testing.assert_allclose(found[12:], np.broadcast_to(matrix @ colour, (28, 50, 5)), atol=0.06)
+    flat = lambda value: np.full((30, 30, 1), value)
+    plain = mapped_colour(flat(0.5), flat(0.25), np.ones((30, 30), bool), flat(1.0))
     np.testing.assert_allclose(plain, 0.5, rtol=0.02)  # nothing varies: the whole picture's
+
+
+@pytest.mark.parametrize("sensor", [RGB, MS, MONO], ids=lambda s: s.name)
+def test_what_is_computed_by_bands_is_what_is_computed_at_once(sensor: Sensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    random, shape = np.random.default_rng(1), (61, 20)
+    rendered = 0.3 + 0.1 * random.random((*shape, sensor.channel_count)).astype(np.float32)
+    raw = (1.1 * rendered if sensor.mosaic is None else 1.1 * photosites_of(rendered, sensor.mosaic)) + 0.02 * random.random(
+        shape if sensor.mosaic is not None else (*shape, 1)
+    )
+    valid = random.random(shape) > 0.05
+    target = random.random((*shape, 4)).astype(np.float32)
+
+    def all_of_it() -> list[np.ndarray]:
+        found = guide(raw, rendered, sensor, valid)
+        colour = mapped_colour(rendered, target, valid, found.residual_colour)
+        return [found.gain, found.residual_colour, found.unexplained, gain_exponent(rendered, target, valid), colour]
+
+    whole = all_of_it()
+    monkeypatch.setattr(filters, "_BAND", 7 * 20)
+    for banded, at_once in zip(all_of_it(), whole, strict=True):
+        np.testing.assert_allclose(banded, at_once, atol=1e-6)
 
 
 def test_the_gain_is_the_weighted_mean_that_it_should_be() -> None:

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from analytic import MS, RGB, AnalyticField, scene_of, sphere
+from analytic import MS, RGB, AnalyticField, WrongField, scene_of, sphere
 
 from mmsynth.errors import InputError
+from mmsynth.field import picture
 from mmsynth.field.picture import Rendering
+from mmsynth.operations.evaluation import evaluate as evaluation
 from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim
 from mmsynth.report.text import score_text
 from mmsynth.scene.image_writers import write_png16
@@ -58,6 +60,27 @@ def test_truth_scores_perfectly(tmp_path: Path) -> None:
         "depth_mae": 0.0, "normal_mae_deg": 0.0, "normal_median_deg": 0.0, "hit_rate": 1.0, "chamfer_visible": 0.0,
     }  # fmt: skip
     assert calls == sorted(calls) and calls[-1][0] == calls[-1][1]
+
+
+def test_scores_of_a_picture_by_bands_are_those_of_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, field = scene_of(AnalyticField(sphere()), tmp_path), WrongField(sphere())
+    whole = score(field, scene)
+    monkeypatch.setattr(picture, "_BAND", 5 * 24)  # rows of 18
+    by_bands = score(field, scene)
+    assert by_bands["geometry"] == whole["geometry"]
+    for name, scores in whole["modalities"].items():
+        figures = {key: value for key, value in scores.items() if isinstance(value, float)}
+        assert {key: by_bands["modalities"][name][key] for key in figures} == pytest.approx(figures, rel=1e-6), name
+
+
+def test_points_of_a_large_picture_are_some_of_its_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of(AnalyticField(sphere()), tmp_path)
+    shifted = Changed(lambda out: {"depth_z": out.depth_z + np.float32(0.01)}, sphere())
+    whole = score(shifted, scene)["geometry"]
+    monkeypatch.setattr(evaluation, "_POINTS", 24 * 18 // 4)
+    some = score(shifted, scene)["geometry"]
+    assert some["depth_mae"] == whole["depth_mae"] and some["chamfer_visible"] == pytest.approx(whole["chamfer_visible"], rel=0.25)
+    assert score(AnalyticField(sphere()), scene)["geometry"]["chamfer_visible"] == 0.0
 
 
 def test_known_errors(tmp_path: Path) -> None:

@@ -57,6 +57,15 @@ def test_aolp_colours(angle: float, colour: tuple[int, int, int]) -> None:
     assert previews.preview_aolp(stokes)[0, 0] == pytest.approx(0.5 * np.array(colour), abs=1e-5)
 
 
+@pytest.mark.parametrize(("shape", "reduced"), [((1848, 2464), (600, 800)), ((900, 30, 3), (800, 27, 3)), ((700, 800, 3), (700, 800, 3))])
+def test_previews_of_large_pictures_are_small(shape: tuple[int, ...], reduced: tuple[int, ...]) -> None:
+    across = np.linspace(0.0, 1.0, shape[1], dtype=np.float32)
+    found = previews.reduced(np.ones(shape, np.float32) * (across if len(shape) == 2 else across[:, None]))
+    assert found.shape == reduced
+    # means over areas
+    assert abs(float(found.mean()) - 0.5) < 1e-3 and 0.0 <= found.min() < 0.03
+
+
 def test_contact_sheet(tmp_path: Path) -> None:
     rows = [[np.zeros((10, 20, 3), np.uint8), np.ones((30, 10))], [np.ones((5, 5, 3))]]
     previews.contact_sheet(rows, [["a", "b"], ["c"]], tmp_path / "sheet.png", height=50)

@@ -1,14 +1,16 @@
 """The operations for float32 on the CPU, fused and compiled by numba; what is not fused is the reference's.
 
 Begin with ``operations``, the autograd functions; the kernels are in ``blocks`` (what all are made of), ``surface``, ``marching`` and
-``tracing_gradients``, ``shading``, ``mirroring`` and ``optimiser``.
+``tracing_gradients``, ``shading``, ``mirroring``, ``drawing`` and ``optimiser``.
 """
 
 from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled
-from mmsynth.field.kernels.cpu.operations import compare, mirror, shade, surface_value, trace
-from mmsynth.field.kernels.cpu.optimiser import adam
+from mmsynth.field.kernels.cpu.drawing import draw, odds
+from mmsynth.field.kernels.cpu.operations import compare, learn, mirror, shade, surface_value, trace
+from mmsynth.field.kernels.cpu.optimiser import adam, adam_together
 from mmsynth.field.kernels.reference import hash_encode, march, section_weights
 
 __all__ = [
-    "KERNELS", "adam", "compare", "hash_encode", "is_compiled", "march", "mirror", "section_weights", "shade", "surface_value", "trace",
+    "KERNELS", "adam", "adam_together", "compare", "draw", "hash_encode", "is_compiled", "learn", "march", "mirror", "odds",
+    "section_weights", "shade", "surface_value", "trace",
 ]  # fmt: skip

@@ -1,14 +1,15 @@
 """Blocks of positions through a hash grid and a small network, on the CPU: what the fused kernels are made of.
 
-A block holds n positions as rows of n numbers, in one flat array: row 0 to 2 are x, y and z, in the frame of the grid; in a
-block for the network row 3 is all ones (so that biases are weights), and the features of the levels follow. Loops over a row
-become vector code. One row of a table is four numbers, one vector register: LLVM would not find that by itself, so reading and
-adding rows is written as vector instructions.
+A block is a matrix with a row for each of n positions: x, y and z, in the frame of the grid, 1 (so that biases are weights), and then the
+features of the levels; rows are as long as whole tiles (see ``matrices``). The features of a level are four numbers, one vector
+register, as is a row of its table: LLVM would not find that by itself, so reading, mixing and adding rows is written as vector
+instructions.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -16,11 +17,13 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, HASH_PRIMES
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, element, splat, whole
 
 _P1 = np.uint32(HASH_PRIMES[1])
 _P2 = np.uint32(HASH_PRIMES[2])
 _VECTOR = ir.VectorType(ir.FloatType(), FEATURES)
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
+_CAREFUL = {"contract", "reassoc", "nsz", "arcp"}  # a gradient that is NaN is not 0
 
 
 def _row(context, builder, table_type, table, row):  # type: ignore[no-untyped-def]
@@ -29,16 +32,15 @@ def _row(context, builder, table_type, table, row):  # type: ignore[no-untyped-d
     return builder.bitcast(builder.gep(data, [offset]), _VECTOR.as_pointer())
 
 
-def splat(builder, value, vector):  # type: ignore[no-untyped-def]
-    """A vector of this type, full of one number."""
-    undefined = ir.Constant(vector, ir.Undefined)
-    first = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_I32, vector.count), [0] * vector.count))
+def _features(context, builder, signature, args, block, position, column):  # type: ignore[no-untyped-def]
+    """The address of four numbers of a block: of its arguments, which are the block, the position and the column."""
+    address, _, _ = element(context, builder, signature.args[block], args[block], args[position], args[column])
+    return builder.bitcast(address, _VECTOR.as_pointer())
 
 
 @intrinsic
-def _mix(typingctx, table, rows, weights):  # type: ignore[no-untyped-def]
-    """Σ weight · row over eight corners: four numbers."""
+def _mix(typingctx, table, rows, weights, block, position, column):  # type: ignore[no-untyped-def]
+    """Σ weight · row over eight corners, into the block."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         total = None
@@ -47,45 +49,44 @@ def _mix(typingctx, table, rows, weights):  # type: ignore[no-untyped-def]
             weight = splat(builder, builder.extract_value(args[2], k), _VECTOR)
             part = builder.fmul(builder.load(row, align=4), weight, flags=("fast",))
             total = part if total is None else builder.fadd(total, part, flags=("fast",))
-        numbers = [builder.extract_element(total, ir.Constant(_I32, k)) for k in range(FEATURES)]
-        return context.make_tuple(builder, signature.return_type, numbers)
+        builder.store(total, _features(context, builder, signature, args, 3, 4, 5), align=4)
+        return context.get_dummy_value()
 
-    return types.UniTuple(types.float32, FEATURES)(table, rows, weights), codegen
+    return types.void(table, rows, weights, block, position, column), codegen
 
 
 @intrinsic
-def _spread(typingctx, table, rows, weights, gradient):  # type: ignore[no-untyped-def]
-    """row += weight · gradient at eight corners."""
+def _spread(typingctx, table, rows, weights, block, position, column):  # type: ignore[no-untyped-def]
+    """row += weight · gradient, which the block holds, at eight corners."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        vector = ir.Constant(_VECTOR, ir.Undefined)
-        for k in range(FEATURES):
-            vector = builder.insert_element(vector, builder.extract_value(args[3], k), ir.Constant(_I32, k))
+        vector = builder.load(_features(context, builder, signature, args, 3, 4, 5), align=4)
         for k in range(8):
             row = _row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k))
             part = builder.fmul(vector, splat(builder, builder.extract_value(args[2], k), _VECTOR), flags=("fast",))
             builder.store(builder.fadd(builder.load(row, align=4), part, flags=("fast",)), row, align=4)
         return context.get_dummy_value()
 
-    return types.void(table, rows, weights, gradient), codegen
+    return types.void(table, rows, weights, block, position, column), codegen
 
 
 @intrinsic
-def _dots(typingctx, table, rows, gradient):  # type: ignore[no-untyped-def]
-    """row · gradient at eight corners: eight numbers."""
+def _dots(typingctx, table, rows, block, position, column):  # type: ignore[no-untyped-def]
+    """row · gradient, which the block holds, at eight corners: eight numbers."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        vector = builder.load(_features(context, builder, signature, args, 2, 3, 4), align=4)
         out = []
         for k in range(8):
             row = builder.load(_row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k)), align=4)
+            product = builder.fmul(row, vector, flags=("fast",))
             total = ir.Constant(ir.FloatType(), 0.0)
             for j in range(FEATURES):
-                value = builder.extract_element(row, ir.Constant(_I32, j))
-                total = builder.fadd(total, builder.fmul(value, builder.extract_value(args[2], j), flags=("fast",)), flags=("fast",))
+                total = builder.fadd(total, builder.extract_element(product, ir.Constant(_I32, j)), flags=("fast",))
             out.append(total)
         return context.make_tuple(builder, signature.return_type, out)
 
-    return types.UniTuple(types.float32, 8)(table, rows, gradient), codegen
+    return types.UniTuple(types.float32, 8)(table, rows, block, position, column), codegen
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -139,170 +140,137 @@ def _level(grid, level):  # type: ignore[no-untyped-def]
     return resolution, np.uint32(rows - 1), (np.int64(resolution) + 1) ** 3 <= rows
 
 
+class SurfaceLayers(NamedTuple):
+    """A ``SurfaceNetwork`` for these blocks: its hidden layer in whole tiles, as it is (H, inputs) and turned (inputs, H)."""
+
+    hidden: np.ndarray
+    turned: np.ndarray
+    output: np.ndarray
+    inner_radius: np.float32
+    outer_radius: np.float32
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def padded_output(output, units):  # type: ignore[no-untyped-def]
+    """Weights (H + 1,) of the last layer, bias last, of so many units as there are in whole tiles."""
+    out = np.zeros(units + 1, np.float32)
+    out[: len(output) - 1] = output[:-1]
+    out[units] = output[-1]
+    return out
+
+
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def encode_block(block, n, grid, first):  # type: ignore[no-untyped-def]
-    """Fill the feature rows, which begin at row ``first``, from the position rows."""
+def encode_block(block, n, grid):  # type: ignore[no-untyped-def]
+    """Fill the features of n positions."""
     scale = np.float32(0.5 / grid.extent)
-    xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
     for level in range(grid.active):
         resolution, mask, dense = _level(grid, level)
         part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
-        row = first + FEATURES * level
-        a, b = block[row * n : (row + 1) * n], block[(row + 1) * n : (row + 2) * n]
-        c, d = block[(row + 2) * n : (row + 3) * n], block[(row + 3) * n : (row + 4) * n]
+        column = FIRST_FEATURE_ROW + FEATURES * level
         for i in range(n):
-            x, fx = _cell(xs[i], scale, resolution)
-            y, fy = _cell(ys[i], scale, resolution)
-            z, fz = _cell(zs[i], scale, resolution)
-            a[i], b[i], c[i], d[i] = _mix(part, _corners(x, y, z, resolution, mask, dense), _weights(fx, fy, fz))
+            x, fx = _cell(block[i, 0], scale, resolution)
+            y, fy = _cell(block[i, 1], scale, resolution)
+            z, fz = _cell(block[i, 2], scale, resolution)
+            _mix(part, _corners(x, y, z, resolution, mask, dense), _weights(fx, fy, fz), block, np.int64(i), np.int64(column))
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def scatter_block(block, n, grid, gradient, level, first):  # type: ignore[no-untyped-def]
-    """Add the feature rows of one level, which hold gradients now, to the gradient of its table."""
+@njit(cache=True, fastmath=_CAREFUL, nogil=True, error_model="numpy")
+def scatter_block(block, n, grid, gradient, level):  # type: ignore[no-untyped-def]
+    """Add the features of one level, which hold gradients now, to the gradient of its table."""
     scale = np.float32(0.5 / grid.extent)
     zero = np.float32(0.0)
-    xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
     resolution, mask, dense = _level(grid, level)
     part = gradient[grid.offsets[level] : grid.offsets[level + 1]]
-    row = first + FEATURES * level
-    a, b = block[row * n : (row + 1) * n], block[(row + 1) * n : (row + 2) * n]
-    c, d = block[(row + 2) * n : (row + 3) * n], block[(row + 3) * n : (row + 4) * n]
+    c = np.int64(FIRST_FEATURE_ROW + FEATURES * level)
     for i in range(n):
-        if a[i] == zero and b[i] == zero and c[i] == zero and d[i] == zero:
+        if block[i, c] == zero and block[i, c + 1] == zero and block[i, c + 2] == zero and block[i, c + 3] == zero:
             continue
-        x, fx = _cell(xs[i], scale, resolution)
-        y, fy = _cell(ys[i], scale, resolution)
-        z, fz = _cell(zs[i], scale, resolution)
-        _spread(part, _corners(x, y, z, resolution, mask, dense), _weights(fx, fy, fz), (a[i], b[i], c[i], d[i]))
+        x, fx = _cell(block[i, 0], scale, resolution)
+        y, fy = _cell(block[i, 1], scale, resolution)
+        z, fz = _cell(block[i, 2], scale, resolution)
+        _spread(part, _corners(x, y, z, resolution, mask, dense), _weights(fx, fy, fz), block, np.int64(i), c)
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def position_block(block, n, grid, first, out):  # type: ignore[no-untyped-def]
-    """Add the gradient to the positions that the feature rows, which hold gradients now, imply: out is three rows of n."""
+def position_block(block, n, grid, out):  # type: ignore[no-untyped-def]
+    """Add the gradient to the positions that the features, which hold gradients now, imply: out (n, 3)."""
     scale = np.float32(0.5 / grid.extent)
     one = np.float32(1.0)
-    xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
     for level in range(grid.active):
         resolution, mask, dense = _level(grid, level)
         part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
         slope = scale * np.float32(resolution)
-        row = first + FEATURES * level
-        a, b = block[row * n : (row + 1) * n], block[(row + 1) * n : (row + 2) * n]
-        c, d = block[(row + 2) * n : (row + 3) * n], block[(row + 3) * n : (row + 4) * n]
+        column = np.int64(FIRST_FEATURE_ROW + FEATURES * level)
         for i in range(n):
-            x, fx = _cell(xs[i], scale, resolution)
-            y, fy = _cell(ys[i], scale, resolution)
-            z, fz = _cell(zs[i], scale, resolution)
-            q0, q1, q2, q3, q4, q5, q6, q7 = _dots(part, _corners(x, y, z, resolution, mask, dense), (a[i], b[i], c[i], d[i]))
+            x, fx = _cell(block[i, 0], scale, resolution)
+            y, fy = _cell(block[i, 1], scale, resolution)
+            z, fz = _cell(block[i, 2], scale, resolution)
+            q0, q1, q2, q3, q4, q5, q6, q7 = _dots(part, _corners(x, y, z, resolution, mask, dense), block, np.int64(i), column)
             gx, gy, gz = one - fx, one - fy, one - fz
-            out[i] += slope * (gy * (gz * (q4 - q0) + fz * (q5 - q1)) + fy * (gz * (q6 - q2) + fz * (q7 - q3)))
-            out[n + i] += slope * (gx * (gz * (q2 - q0) + fz * (q3 - q1)) + fx * (gz * (q6 - q4) + fz * (q7 - q5)))
-            out[2 * n + i] += slope * (gx * (gy * (q1 - q0) + fy * (q3 - q2)) + fx * (gy * (q5 - q4) + fy * (q7 - q6)))
+            out[i, 0] += slope * (gy * (gz * (q4 - q0) + fz * (q5 - q1)) + fy * (gz * (q6 - q2) + fz * (q7 - q3)))
+            out[i, 1] += slope * (gx * (gz * (q2 - q0) + fz * (q3 - q1)) + fx * (gz * (q6 - q4) + fz * (q7 - q5)))
+            out[i, 2] += slope * (gx * (gy * (q1 - q0) + fy * (q3 - q2)) + fx * (gy * (q5 - q4) + fy * (q7 - q6)))
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def surface_block(block, hidden, out, n, grid, network):  # type: ignore[no-untyped-def]
-    """Signed distance of a block: grid, one hidden layer of rectified units, a linear layer, and the initial spheres.
+def surface_block(block, hidden, out, n, grid, layers):  # type: ignore[no-untyped-def]
+    """Signed distance of n positions: grid, one hidden layer of rectified units, a linear layer, and the initial spheres.
 
-    H is a multiple of four; the columns of the layer's weights are the rows of the block.
-    hidden: H rows, kept for the backward pass. out: (n,).
+    Rows are used up to whole tiles. hidden: (n, H), kept for the backward pass. out: (n,).
     """
-    encode_block(block, n, grid, FIRST_FEATURE_ROW)
-    weight, output = network.hidden, network.output
-    units = weight.shape[0]
+    encode_block(block, n, grid)
+    output, rows, units = layers.output, whole(n, TILE_ROWS), layers.turned.shape[1]
+    inner, outer = layers.inner_radius, layers.outer_radius
     zero = np.float32(0.0)
-    xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    inner, outer = network.inner_radius, network.outer_radius
+    clear(hidden, rows, units)
+    add_product(block, layers.turned, hidden, rows, FIRST_FEATURE_ROW + FEATURES * grid.active, units)
     for i in range(n):
-        r = np.float32(math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i]))
-        out[i] = output[units] + min(r - inner, outer - r)
-    for k in range(units):
-        h = hidden[k * n : (k + 1) * n]
-        w0, w1, w2, w3 = weight[k, 0], weight[k, 1], weight[k, 2], weight[k, 3]
-        for i in range(n):
-            h[i] = xs[i] * w0 + ys[i] * w1 + zs[i] * w2 + w3
-        for j in range(FIRST_FEATURE_ROW, FIRST_FEATURE_ROW + FEATURES * grid.active, 4):
-            f0, f1 = block[j * n : (j + 1) * n], block[(j + 1) * n : (j + 2) * n]
-            f2, f3 = block[(j + 2) * n : (j + 3) * n], block[(j + 3) * n : (j + 4) * n]
-            w0, w1, w2, w3 = weight[k, j], weight[k, j + 1], weight[k, j + 2], weight[k, j + 3]
-            for i in range(n):
-                h[i] += f0[i] * w0 + f1[i] * w1 + f2[i] * w2 + f3[i] * w3
-        w = output[k]
-        for i in range(n):
-            v = max(h[i], zero)
-            h[i] = v
-            out[i] += w * v
+        x, y, z = block[i, 0], block[i, 1], block[i, 2]
+        r = np.float32(math.sqrt(x * x + y * y + z * z))
+        h, total = hidden[i], zero
+        for k in range(units):
+            h[k] = max(h[k], zero)
+            total += h[k] * output[k]
+        out[i] = total + output[units] + min(r - inner, outer - r)
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def surface_block_backward(block, hidden, g, n, active, network, row, hidden_out, output_out):  # type: ignore[no-untyped-def]
-    """Gradients of a block for gradients g (n,) of its distances.
+def surface_block_backward(block, hidden, g, n, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
+    """Gradients of n positions for gradients g (n,) of their distances.
 
-    The weights' gradients are added to. Hidden and feature rows are replaced by their gradients. row: scratch of n numbers.
+    The weights' gradients, turned_out (inputs, H) and output_out (H + 1,), are added to. Hidden units and features are replaced by theirs.
     """
-    weight, output = network.hidden, network.output
-    units = weight.shape[0]
+    output, rows, units = layers.output, whole(n, TILE_ROWS), layers.turned.shape[1]
     zero = np.float32(0.0)
-    total = zero
     for i in range(n):
-        total += g[i]
-    output_out[units] += total
-    for k in range(units):
-        h = hidden[k * n : (k + 1) * n]
-        w = output[k]
-        s0, s1 = zero, zero
-        for i in range(n):
-            s0 += h[i] * g[i]
-            h[i] = w * g[i] if h[i] > zero else zero
-            s1 += h[i]
-        output_out[k] += s0
-        hidden_out[k, 3] += s1
-    for j in range(FIRST_FEATURE_ROW + FEATURES * active):
-        if j == 3:
-            continue
-        f = block[j * n : (j + 1) * n]
-        for i in range(n):
-            row[i] = zero
-        for k in range(0, units, 4):
-            h0, h1 = hidden[k * n : (k + 1) * n], hidden[(k + 1) * n : (k + 2) * n]
-            h2, h3 = hidden[(k + 2) * n : (k + 3) * n], hidden[(k + 3) * n : (k + 4) * n]
-            w0, w1, w2, w3 = weight[k, j], weight[k + 1, j], weight[k + 2, j], weight[k + 3, j]
-            s0, s1, s2, s3 = zero, zero, zero, zero
-            for i in range(n):
-                v = f[i]
-                a, b, c, d = h0[i], h1[i], h2[i], h3[i]
-                s0 += a * v
-                s1 += b * v
-                s2 += c * v
-                s3 += d * v
-                row[i] += a * w0 + b * w1 + c * w2 + d * w3
-            hidden_out[k, j] += s0
-            hidden_out[k + 1, j] += s1
-            hidden_out[k + 2, j] += s2
-            hidden_out[k + 3, j] += s3
-        if j >= FIRST_FEATURE_ROW:
-            for i in range(n):
-                f[i] = row[i]
+        h, pull = hidden[i], g[i]
+        output_out[units] += pull
+        for k in range(units):
+            output_out[k] += h[k] * pull
+            h[k] = output[k] * pull if h[k] > zero else zero
+    inputs = FIRST_FEATURE_ROW + FEATURES * active
+    add_product(block.T, hidden, turned_out, inputs, n, units)
+    for i in range(n, rows):
+        for k in range(units):
+            hidden[i, k] = zero
+    features, weights = block[:, FIRST_FEATURE_ROW:], layers.hidden[:, FIRST_FEATURE_ROW:]
+    clear(features, rows, features.shape[1])
+    add_product(hidden, weights, features, rows, units, whole(FEATURES * active, TILE_COLS))
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def surface_block_positions(block, hidden, g, n, grid, network, out):  # type: ignore[no-untyped-def]
-    """After ``surface_block_backward``: gradient to the positions, out: three rows of n, overwritten."""
-    xs, ys, zs = block[0:n], block[n : 2 * n], block[2 * n : 3 * n]
-    inner, outer = network.inner_radius, network.outer_radius
+def surface_block_positions(block, hidden, g, n, grid, layers, out):  # type: ignore[no-untyped-def]
+    """After ``surface_block_backward``: gradients to the positions, out (n, 3), overwritten."""
+    inner, outer = layers.inner_radius, layers.outer_radius
     for i in range(n):
-        r = np.float32(math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i]))
+        x, y, z = block[i, 0], block[i, 1], block[i, 2]
+        r = np.float32(math.sqrt(x * x + y * y + z * z))
         away = g[i] / max(r, np.float32(1e-12))
         if outer - r < r - inner:
             away = -away
-        out[i], out[n + i], out[2 * n + i] = away * xs[i], away * ys[i], away * zs[i]
-    weight = network.hidden
-    for k in range(weight.shape[0]):
-        h = hidden[k * n : (k + 1) * n]
-        w0, w1, w2 = weight[k, 0], weight[k, 1], weight[k, 2]
-        for i in range(n):
-            out[i] += w0 * h[i]
-            out[n + i] += w1 * h[i]
-            out[2 * n + i] += w2 * h[i]
-    position_block(block, n, grid, FIRST_FEATURE_ROW, out)
+        for a in range(3):
+            out[i, a] = away * block[i, a]
+        for k in range(layers.turned.shape[1]):
+            for a in range(3):
+                out[i, a] += layers.turned[a, k] * hidden[i, k]
+    position_block(block, n, grid, out)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mmsynth.field.kernels.cpu import marching, mirroring, optimiser, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, optimiser, shading, surface, tracing_gradients
 
 KERNELS = (
     surface.surface_forward, surface.surface_backward, surface.surface_scatter,
     marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
     shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward,
-    optimiser.adam_parts, optimiser.adam_part,
+    learning.learn_rays, learning.learn_tables, drawing.draw_rays, drawing.fill_odds, optimiser.adam_parts,
 )  # fmt: skip
 
 

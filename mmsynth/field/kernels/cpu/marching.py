@@ -30,10 +30,13 @@ from mmsynth.field.kernels.constants import (
     SOFT_SURFACE,
     SOLID,
 )
-from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
+from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, encode_block, padded_output, surface_block
+from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
+from mmsynth.field.kernels.cpu.matrices import padded_to
 
-CHUNK = 256  # rays
+CHUNK = 128  # rays
 LANES = 64
+CAPACITY = CHUNK * MAX_SAMPLES_PER_RAY + 8  # samples of a chunk, and room for whole tiles
 _LONGEST_STEP = np.float32(LONGEST_STEP)
 _LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
@@ -42,14 +45,7 @@ _FACE_OVERSHOOT = np.float32(FACE_OVERSHOOT)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _softplus(x):  # type: ignore[no-untyped-def]
-    if abs(x) > 40.0:  # exp(-40) is below the rounding of 1
-        return max(x, 0.0)
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _contract(x, y, z):  # type: ignore[no-untyped-def]
+def contract(x, y, z):  # type: ignore[no-untyped-def]
     """Contracted position (mip-NeRF 360, eq. 10) and the distance from the centre."""
     r = np.float32(math.sqrt(x * x + y * y + z * z))
     if r <= np.float32(1.0):
@@ -59,7 +55,7 @@ def _contract(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always", error_model="numpy")
-def _velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
+def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Change of the contracted position per unit of ray distance, for a point at distance r from the centre."""
     if r <= np.float32(1.0):
         return dx, dy, dz
@@ -71,123 +67,129 @@ def _velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, step, states, extent, contracted):  # type: ignore[no-untyped-def]
-    """The first place at or after t where a surface may be: t, position, speed there, state; t >= far when there is none."""
+def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted, skipped):  # type: ignore[no-untyped-def]
+    """t, position, distance from the centre, speed and state: at t where a surface may be there, else, with the state of a free cell,
+    behind that cell. skipped: whether the ray comes from one."""
     grid = states.shape[0]
-    half = np.float32(0.5 * grid / extent)
-    skipped = False
-    while t < far:
-        x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-        r = np.float32(0.0)
-        if contracted:
-            cx, cy, cz, r = _contract(x, y, z)
-            vx, vy, vz = _velocity(x, y, z, r, dx, dy, dz)
-        else:
-            cx, cy, cz, vx, vy, vz = x, y, z, dx, dy, dz
-        speed = np.float32(math.sqrt(vx * vx + vy * vy + vz * vz))
-        ix = min(max(int((cx + extent) * half), 0), grid - 1)
-        iy = min(max(int((cy + extent) * half), 0), grid - 1)
-        iz = min(max(int((cz + extent) * half), 0), grid - 1)
-        state = states[ix, iy, iz]
-        if state < OUTSIDE:
-            if skipped:  # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
-                t += jitter * step / speed
-                x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-                if contracted:
-                    cx, cy, cz, _ = _contract(x, y, z)
-                else:
-                    cx, cy, cz = x, y, z
-            return t, cx, cy, cz, r, speed, state
-        skipped = True
-        leave = _NO_CROSSING
-        if abs(vx) > ALONG_FACE:
-            leave = min(leave, (np.float32(ix + (1 if vx > 0 else 0)) / half - extent - cx) / vx)
-        if abs(vy) > ALONG_FACE:
-            leave = min(leave, (np.float32(iy + (1 if vy > 0 else 0)) / half - extent - cy) / vy)
-        if abs(vz) > ALONG_FACE:
-            leave = min(leave, (np.float32(iz + (1 if vz > 0 else 0)) / half - extent - cz) / vz)
-        # the cell's certificate may reach beyond it
-        leave = max(leave, np.float32(state - OUTSIDE) / (half * speed * np.float32(2.0))) + _FACE_OVERSHOOT * step / speed
-        if contracted:
-            leave = min(leave, _LONGEST_STEP * max(r, np.float32(1.0)))
-        t = max(t + leave, t * _LEAST_ADVANCE)
-    return far, np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(1.0), np.uint8(0)
+    half, width = np.float32(0.5 * grid / extent), np.float32(2.0 * extent / grid)
+    x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+    cx, cy, cz, vx, vy, vz, r, speed = x, y, z, dx, dy, dz, np.float32(1.0), np.float32(1.0)
+    if contracted:
+        square = x * x + y * y + z * z
+        if square > np.float32(1.0):  # ``contract`` and ``velocity`` at once, of a direction of unit length
+            r = np.float32(math.sqrt(square))
+            inverse = np.float32(1.0) / r
+            k = (np.float32(2.0) - inverse) * inverse
+            along = (x * dx + y * dy + z * dz) * inverse
+            radial = along * (inverse * inverse - k) * inverse
+            cx, cy, cz = x * k, y * k, z * k
+            vx, vy, vz = dx * k + x * radial, dy * k + y * radial, dz * k + z * radial
+            # from the parts along the radius and across it: 1 - along² would be rounding alone far away
+            along *= inverse
+            px, py, pz = dx - x * along, dy - y * along, dz - z * along
+            outward = along * inverse
+            speed = np.float32(math.sqrt(k * k * (px * px + py * py + pz * pz) + outward * outward))
+    ix = min(max(int((cx + extent) * half), 0), grid - 1)
+    iy = min(max(int((cy + extent) * half), 0), grid - 1)
+    iz = min(max(int((cz + extent) * half), 0), grid - 1)
+    state = states[ix, iy, iz]
+    if state < OUTSIDE:
+        if skipped:  # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
+            t += jitter * step / speed
+            x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
+            if contracted:
+                cx, cy, cz, _ = contract(x, y, z)
+            else:
+                cx, cy, cz = x, y, z
+        return t, cx, cy, cz, r, speed, state
+    leave = _NO_CROSSING
+    if abs(vx) > ALONG_FACE:
+        leave = min(leave, (np.float32(ix + (1 if vx > 0 else 0)) * width - extent - cx) / vx)
+    if abs(vy) > ALONG_FACE:
+        leave = min(leave, (np.float32(iy + (1 if vy > 0 else 0)) * width - extent - cy) / vy)
+    if abs(vz) > ALONG_FACE:
+        leave = min(leave, (np.float32(iz + (1 if vz > 0 else 0)) * width - extent - cz) / vz)
+    # the cell's certificate may reach beyond it
+    leave = max(leave, np.float32(state - OUTSIDE) / (half * speed * np.float32(2.0))) + _FACE_OVERSHOOT * step / speed
+    if contracted:
+        leave = min(leave, _LONGEST_STEP * max(r, np.float32(1.0)))
+    return max(t + leave, t * _LEAST_ADVANCE), cx, cy, cz, r, speed, state
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _to_rows(block, n):  # type: ignore[no-untyped-def]
-    """x y z x y z ... → a row of x, of y, of z."""
-    copy = block[: 3 * n].copy()
-    for i in range(n):
-        block[i] = copy[3 * i]
-        block[n + i] = copy[3 * i + 1]
-        block[2 * n + i] = copy[3 * i + 2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _march(begin, count, slot, rays, states, sampling, grid, network, store):  # type: ignore[no-untyped-def]
+def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):  # type: ignore[no-untyped-def]
     """Samples of the rays of a chunk and their distances, see ``reference.march``: how many."""
-    size = FIRST_FEATURE_ROW + FEATURES * grid.resolutions.shape[0]
-    units = network.hidden.shape[0]
     contracted = grid.extent > np.float32(1.0)
     sharpness, step, factor = sampling.sharpness, np.float32(sampling.step), np.float32(sampling.sphere_step_factor)
     min_slope = np.float32(sampling.min_slope)
     origins, directions = rays.origins, rays.directions
-    t_of, f_of, p_of, counts = store.t_of, store.f_of, store.p_of, store.counts
+    t_of, f_of, p_of, q_of, counts = store.t_of, store.f_of, store.p_of, store.q_of, store.counts
+    depths, densities = np.empty(LANES, np.float64), np.empty(LANES, np.float64)
+    block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
     # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
     where = np.empty(CHUNK, np.float32)
-    tau_of = np.empty(CHUNK, np.float64)
+    tau_of = np.zeros(CHUNK, np.float64)
+    for i in range(count):
+        where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
+        counts[slot, i] = 0
     speed_of = np.empty(CHUNK, np.float32)
     reach_of = np.empty(CHUNK, np.float32)
     state_of = np.empty(CHUNK, np.uint8)
-    lanes = np.empty(LANES, np.int32)
+    lanes, todo = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
+    skipped = np.zeros(CHUNK, np.bool_)
     going = 0
     waiting = 0
-    used = 0
-    blocks = 0
+    used = np.int64(0)
     while going > 0 or waiting < count:
         n = np.int64(0)
-        f = store.block[slot, used * size :]
-        taken = 0
-        while n < LANES and (taken < going or waiting < count):
-            if taken < going:
-                i = lanes[taken]
-                taken += 1
-            else:
-                i = np.int32(waiting)
-                waiting += 1
-                where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
-                tau_of[i] = 0.0
-                counts[slot, i] = 0
-            o = begin + i
-            t, x, y, z, r, speed, state = _advance(
-                origins[o, 0], origins[o, 1], origins[o, 2], directions[o, 0], directions[o, 1], directions[o, 2],
-                where[i], rays.far[o], rays.jitter[o], step, states, grid.extent, contracted,
-            )  # fmt: skip
-            if t >= rays.far[o]:
-                continue
-            where[i] = t
-            speed_of[i], reach_of[i], state_of[i] = speed, r, state
-            lanes[n] = i
-            # rows are laid out once n is known
-            f[3 * n], f[3 * n + 1], f[3 * n + 2] = x, y, z
-            n += 1
+        pending = going
+        todo[:going] = lanes[:going]
+        while pending < LANES and waiting < count:
+            todo[pending] = waiting
+            pending += 1
+            waiting += 1
+        # all lanes go on by a cell in turn, and not one lane by all its cells: reading the states takes long, and so these reads overlap
+        while pending > 0:
+            left = 0
+            for a in range(pending):
+                i = todo[a]
+                o = begin + i
+                t = where[i]
+                if t >= rays.far[o]:
+                    if waiting < count:
+                        todo[left] = waiting
+                        left += 1
+                        waiting += 1
+                    continue
+                t, x, y, z, r, speed, state = _advance(
+                    origins[o, 0], origins[o, 1], origins[o, 2], directions[o, 0], directions[o, 1], directions[o, 2],
+                    t, rays.jitter[o], step, states, grid.extent, contracted, skipped[i],
+                )  # fmt: skip
+                where[i] = t
+                skipped[i] = state >= OUTSIDE
+                if state >= OUTSIDE:
+                    todo[left] = i
+                    left += 1
+                elif t < rays.far[o]:
+                    speed_of[i], reach_of[i], state_of[i] = speed, r, state
+                    lanes[n] = i
+                    block[used + n, 0], block[used + n, 1], block[used + n, 2], block[used + n, 3] = x, y, z, np.float32(1.0)
+                    n += 1
+            pending = left
         if n == 0:
             break
-        _to_rows(f, n)
-        for i in range(3 * n, 4 * n):
-            f[i] = np.float32(1.0)
-        surface_block(f, store.hidden[slot, used * units :], store.sdf[slot, used : used + n], n, grid, network)
+        surface_block(block[used:], hidden[used:], sdf[used:], n, grid, layers)
+        negative_log_cdf(sdf[used:], n, sharpness, depths, densities)
         going = 0
         for a in range(n):
             i = lanes[a]
             k = counts[slot, i]
-            value = store.sdf[slot, used + a]
+            value = sdf[used + a]
             t = where[i]
             here = i * MAX_SAMPLES_PER_RAY + k
             t_of[slot, here] = t
             f_of[slot, here] = value
-            p_of[slot, here] = _softplus(-sharpness * np.float64(value))
+            p_of[slot, here], q_of[slot, here] = depths[a], densities[a]
             store.id_of[slot, here] = used + a
             store.ray_of[slot, used + a] = i
             store.time_of[slot, used + a] = t
@@ -208,15 +210,13 @@ def _march(begin, count, slot, rays, states, sampling, grid, network, store):  #
             where[i] = t + jump
             lanes[going] = i
             going += 1
-        store.sizes[slot, blocks] = n
-        blocks += 1
-        used += int(n)
-    store.rounds[slot, 0] = blocks
+        used += n
+    store.samples[slot, 0] = used
     return used
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight, depth):  # type: ignore[no-untyped-def]
+def find_sections(begin, count, slot, rays, contracted, sampling, store, weight, depth):  # type: ignore[no-untyped-def]
     """Weights of the sections of a chunk's rays: depth, and the sections that matter, in the order of the rays: how many.
 
     weight: (2, R) of the nearest surface of each ray and of what is behind it.
@@ -228,7 +228,7 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
     gap = np.float32(LAYER_GAP / sampling.sharpness)
     for i in range(count):
         o = begin + i
-        tau_sum = 0.0
+        tau_sum, transmittance = 0.0, 1.0
         before = 0.0
         nearest = -1.0  # the weight of the nearest surface, once there is a second
         first = sections
@@ -237,14 +237,18 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
         for k in range(store.counts[slot, i] - 1):
             here = i * MAX_SAMPLES_PER_RAY + k
             tau = p_of[slot, here + 1] - p_of[slot, here]
+            store.opacity_of[slot, here] = 0.0
             if tau < 1e-7:
                 continue
             f0 = f_of[slot, here]
             f1 = f_of[slot, here + 1]
-            w = math.exp(-tau_sum) * -math.expm1(-tau)
+            opacity = -math.expm1(-tau)
+            store.opacity_of[slot, here] = opacity
+            w = transmittance * opacity
+            transmittance -= w
             tau_sum += tau
             if tau_sum > sampling.max_optical_depth:  # the ray was ended here: what is left belongs to this surface, too
-                w += math.exp(-tau_sum)
+                w += transmittance
             if w > min_weight or (before < 0.5 and before + w >= 0.5):
                 crossing = np.float32(0.5)
                 if f0 > 0 and f1 <= 0:
@@ -258,16 +262,14 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
                     y = origins[o, 1] + directions[o, 1] * t
                     z = origins[o, 2] + directions[o, 2] * t
                     if contracted:
-                        x, y, z, _ = _contract(x, y, z)
+                        x, y, z, _ = contract(x, y, z)
                     if sections > first and nearest < 0.0:
-                        last = 3 * (sections - 1)
-                        dx, dy, dz = x - s_block[slot, last], y - s_block[slot, last + 1], z - s_block[slot, last + 2]
+                        last = sections - 1
+                        dx, dy, dz = x - s_block[slot, last, 0], y - s_block[slot, last, 1], z - s_block[slot, last, 2]
                         if math.sqrt(dx * dx + dy * dy + dz * dz) > gap:
                             nearest = before
                             store.second[slot, i] = k
-                    s_block[slot, 3 * sections] = x
-                    s_block[slot, 3 * sections + 1] = y
-                    s_block[slot, 3 * sections + 2] = z
+                    s_block[slot, sections, 0], s_block[slot, sections, 1], s_block[slot, sections, 2] = x, y, z
                     store.s_ray[slot, sections] = i
                     store.s_k[slot, sections] = k
                     store.s_time[slot, sections] = t
@@ -281,11 +283,10 @@ def _find_sections(begin, count, slot, rays, contracted, sampling, store, weight
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
+def composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
     """Features and distance of a chunk's rays: the mean over the sections of each surface, (2, R, F) and (2, R)."""
-    s_block, width = store.s_block, FEATURES * appearance.active
-    _to_rows(s_block[slot], sections)
-    encode_block(s_block[slot], sections, appearance, 3)
+    s_block, width = store.s_block[slot], FEATURES * appearance.active
+    encode_block(s_block, sections, appearance)
     shown[:, begin : begin + count] = np.float32(0.0)
     features[:, begin : begin + count] = np.float32(0.0)
     distance[:, begin : begin + count] = np.float32(0.0)
@@ -296,7 +297,7 @@ def _composite(begin, count, slot, sections, appearance, store, features, distan
         shown[which, begin + i] += w
         distance[which, begin + i] += w * store.s_time[slot, s]
         for j in range(width):
-            features[which, begin + i, j] += w * s_block[slot, (3 + j) * sections + s]
+            features[which, begin + i, j] += w * s_block[s, FIRST_FEATURE_ROW + j]
     for i in range(count):
         for which in range(2 if store.second[slot, i] < MAX_SAMPLES_PER_RAY else 1):
             scale = np.float32(1.0) / max(shown[which, begin + i], _LEAST_WEIGHT)
@@ -309,11 +310,16 @@ def _composite(begin, count, slot, sections, appearance, store, features, distan
 def trace_forward(rays, states, sampling, grid, network, appearance, keep, store, out):  # type: ignore[no-untyped-def]
     """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
     total, samples = rays.origins.shape[0], out.samples  # in a parallel loop, numba would not set a tuple's arrays
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    layers = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         slot = np.int64(chunk) if keep else np.int64(get_thread_id())
         begin = np.int64(chunk) * CHUNK
         count = min(CHUNK, total - begin)
-        samples[chunk] = _march(begin, count, slot, rays, states, sampling, grid, network, store)
+        samples[chunk] = march_rays(begin, count, slot, rays, states, sampling, grid, layers, store)
         contracted = grid.extent > np.float32(1.0)
-        sections = _find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
-        _composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)
+        sections = find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
+        composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)

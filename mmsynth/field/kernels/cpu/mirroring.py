@@ -114,149 +114,160 @@ def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
     return _f(0.5) * (_ONE + terms[20] * (_TWO * e * e - _ONE))
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
+    """``mirror`` of some rays; ray0 + begin: the first of them in ``measured.ray``."""
+    count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
+    raw = mirrors.material
+    terms = np.empty(21, np.float32)
+    last = first_at(measured.ray, ray0 + begin)
+    for o in range(begin, end):
+        first = last
+        while last < len(measured.ray) and measured.ray[last] == ray0 + o:
+            out[last] = _ZERO
+            last += 1
+        for which in range(2 if behind[o] >= 0 else 1):
+            row = o if which == 0 else behind[o]
+            if mirrors.share[row] <= _ZERO:
+                continue
+            alpha, strength = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0]), _softplus(raw[row, 1])
+            if last > bright:
+                _around(row, mirrors, terms)
+                mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
+                light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
+                for m in range(first, last):
+                    e = terms[0] * measured.axes[m - bright, 0] + terms[1] * measured.axes[m - bright, 1]
+                    e += terms[2] * measured.axes[m - bright, 2]
+                    out[m] += _f(0.5) * mirrors.share[row] * (light + polarized * (_TWO * e * e - terms[3]))
+            polarizing = _sigmoid(raw[row, 4])
+            for k in range(count):
+                _terms(row, k, lamps, mirrors, last > bright, terms)
+                if last > bright:
+                    terms[20] *= polarizing
+                amount = mirrors.share[row] * _amount(alpha, strength, _sigmoid(raw[row, 5 + k]), terms)
+                for m in range(first, last):
+                    passed = _ONE if m < bright else _passed(terms, measured.axes, m - bright)
+                    out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
+
+
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.mirror``; ``measured.ray`` never decreases."""
-    rays, count = behind.shape[0], lamps.position.shape[0]
-    bright = len(measured.ray) - len(measured.axes)
-    raw = mirrors.material
+    rays = behind.shape[0]
     for task in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(task) * CHUNK
-        end = min(begin + CHUNK, rays)
-        terms = np.empty(21, np.float32)
-        last = first_at(measured.ray, begin)
-        for o in range(begin, end):
-            first = last
-            while last < len(measured.ray) and measured.ray[last] == o:
-                out[last] = _ZERO
-                last += 1
-            for which in range(2 if behind[o] >= 0 else 1):
-                row = o if which == 0 else behind[o]
-                if mirrors.share[row] <= _ZERO:
-                    continue
-                alpha, strength = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0]), _softplus(raw[row, 1])
+        mirror_rays(begin, min(begin + CHUNK, rays), np.int64(0), lamps, mirrors, behind, measured, out)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
+    """``mirror_backward`` of some rays; gradients of the lamps are added to those of the chunk."""
+    count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
+    g_material, g_normals, g_share, g_position, g_spectrum = out.material, out.normals, out.share, out.position, out.spectrum
+    raw = mirrors.material
+    terms = np.empty(21, np.float32)
+    last = first_at(measured.ray, ray0 + begin)
+    for o in range(begin, end):
+        first = last
+        while last < len(measured.ray) and measured.ray[last] == ray0 + o:
+            last += 1
+        for which in range(2 if behind[o] >= 0 else 1):
+            row = o if which == 0 else behind[o]
+            g_share[row] = _ZERO
+            g_normals[row] = _ZERO
+            g_material[row] = _ZERO
+            share = mirrors.share[row]
+            if share <= _ZERO:
+                continue
+            gate = _sigmoid(raw[row, 0])
+            alpha = _LEAST + (_ONE - _LEAST) * gate
+            square, c = alpha * alpha, _f(0.5) * alpha
+            strength, slope = _softplus(raw[row, 1]), _sigmoid(raw[row, 1])
+            g_alpha, g_polarizing, polarizing = _ZERO, _ZERO, _sigmoid(raw[row, 4])
+            if last > bright:
+                _around(row, mirrors, terms)
+                wx, wy, wz = terms[0], terms[1], terms[2]
+                mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
+                light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
+                gwx, gwy, gwz, whole, turned = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+                for m in range(first, last):
+                    ex, ey, ez = measured.axes[m - bright, 0], measured.axes[m - bright, 1], measured.axes[m - bright, 2]
+                    e = wx * ex + wy * ey + wz * ez
+                    whole += _f(0.5) * g[m]
+                    turned += _f(0.5) * g[m] * (_TWO * e * e - terms[3])
+                    gwx += g[m] * (_TWO * e * ex - wx)
+                    gwy += g[m] * (_TWO * e * ey - wy)
+                    gwz += g[m] * (_TWO * e * ez - wz)
+                g_share[row] += whole * light + turned * polarized
+                g_material[row, 2] += share * (whole + turned * terms[5]) * terms[4] * _sigmoid(raw[row, 2])
+                g_material[row, 3] += share * (whole - turned * terms[6]) * _sigmoid(raw[row, 3])
+                # w = v × n
+                vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
+                pull = share * polarized
+                g_normals[row, 0] += pull * (gwy * vz - gwz * vy)
+                g_normals[row, 1] += pull * (gwz * vx - gwx * vz)
+                g_normals[row, 2] += pull * (gwx * vy - gwy * vx)
+            for k in range(count):
+                visible = _sigmoid(raw[row, 5 + k])
+                _terms(row, k, lamps, mirrors, last > bright, terms)
+                amount = _amount(alpha, strength, visible, terms)
+                pull, degree = _ZERO, terms[20]
                 if last > bright:
-                    _around(row, mirrors, terms)
-                    mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
-                    light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
-                    for m in range(first, last):
-                        e = terms[0] * measured.axes[m - bright, 0] + terms[1] * measured.axes[m - bright, 1]
-                        e += terms[2] * measured.axes[m - bright, 2]
-                        out[m] += _f(0.5) * mirrors.share[row] * (light + polarized * (_TWO * e * e - terms[3]))
-                polarizing = _sigmoid(raw[row, 4])
-                for k in range(count):
-                    _terms(row, k, lamps, mirrors, last > bright, terms)
-                    if last > bright:
-                        terms[20] *= polarizing
-                    amount = mirrors.share[row] * _amount(alpha, strength, _sigmoid(raw[row, 5 + k]), terms)
-                    for m in range(first, last):
-                        passed = _ONE if m < bright else _passed(terms, measured.axes, m - bright)
-                        out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
+                    terms[20] *= polarizing
+                for m in range(first, last):
+                    passed = g[m]
+                    if m >= bright:
+                        passed *= _passed(terms, measured.axes, m - bright)
+                        e = terms[17] * measured.axes[m - bright, 0] + terms[18] * measured.axes[m - bright, 1]
+                        e += terms[19] * measured.axes[m - bright, 2]
+                        turned = g[m] * lamps.spectrum[k, measured.output[m]] * _f(0.5) * degree * (_TWO * e * e - _ONE)
+                        g_polarizing += share * amount * turned
+                    pull += passed * lamps.spectrum[k, measured.output[m]]
+                    g_spectrum[chunk, k, measured.output[m]] += passed * share * amount
+                g_share[row] += pull * amount
+                if terms[16] == _ZERO:
+                    continue
+                pull *= share
+                rest = terms[16] * strength * visible
+                off, nl, nv, a, b = terms[11], terms[12], terms[13], terms[14], terms[15]
+                under = square + (_ONE - square) * off
+                u = square / under
+                lobe, seen = u * u, nl / (a * b)
+                g_material[row, 1] += pull * terms[16] * visible * lobe * seen * slope
+                g_material[row, 5 + k] += pull * rest * lobe * seen * (_ONE - visible)
+                g_off = -pull * rest * seen * _TWO * lobe * (_ONE - square) / under
+                g_square = pull * rest * seen * _TWO * u * off / (under * under)
+                g_nl = pull * rest * lobe * c / (a * a * b) if nl > _ZERO else _ZERO
+                g_nv = -pull * rest * lobe * nl * (_ONE - c) / (a * b * b) if nv > _ZERO else _ZERO
+                g_c = -pull * rest * lobe * nl * ((_ONE - nl) / (a * a * b) + (_ONE - nv) / (a * b * b))
+                g_alpha += g_square * _TWO * alpha + _f(0.5) * g_c
+                nx, ny, nz = mirrors.normals[row, 0], mirrors.normals[row, 1], mirrors.normals[row, 2]
+                tx, ty, tz, hx, hy, hz = terms[0], terms[1], terms[2], terms[4], terms[5], terms[6]
+                wx, wy, wz = terms[8], terms[9], terms[10]
+                q = _TWO * g_off
+                # |n × h|²: to n it is 2 h × (n × h), to h 2 (n × h) × n
+                g_normals[row, 0] += q * (hy * wz - hz * wy) + g_nl * tx - g_nv * mirrors.directions[row, 0]
+                g_normals[row, 1] += q * (hz * wx - hx * wz) + g_nl * ty - g_nv * mirrors.directions[row, 1]
+                g_normals[row, 2] += q * (hx * wy - hy * wx) + g_nl * tz - g_nv * mirrors.directions[row, 2]
+                ghx, ghy, ghz = q * (wy * nz - wz * ny), q * (wz * nx - wx * nz), q * (wx * ny - wy * nx)
+                along = ghx * hx + ghy * hy + ghz * hz
+                gtx = g_nl * nx + (ghx - along * hx) / terms[7]
+                gty = g_nl * ny + (ghy - along * hy) / terms[7]
+                gtz = g_nl * nz + (ghz - along * hz) / terms[7]
+                along = gtx * tx + gty * ty + gtz * tz
+                g_position[chunk, k, 0] += (gtx - along * tx) / terms[3]
+                g_position[chunk, k, 1] += (gty - along * ty) / terms[3]
+                g_position[chunk, k, 2] += (gtz - along * tz) / terms[3]
+            g_material[row, 4] = g_polarizing * polarizing * (_ONE - polarizing)
+            g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate * (_ONE - gate)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """g: (M,) gradients of the numbers; out: ``Gradients``."""
-    rays, count = behind.shape[0], lamps.position.shape[0]
-    bright = len(measured.ray) - len(measured.axes)
-    g_material, g_normals, g_share, g_position, g_spectrum = out.material, out.normals, out.share, out.position, out.spectrum
-    raw = mirrors.material
+    rays, g_position, g_spectrum = behind.shape[0], out.position, out.spectrum
     for task in prange((rays + CHUNK - 1) // CHUNK):
         chunk = np.int64(task)
         begin = chunk * CHUNK
-        terms = np.empty(21, np.float32)
         g_position[chunk], g_spectrum[chunk] = _ZERO, _ZERO
-        last = first_at(measured.ray, begin)
-        for o in range(begin, min(begin + CHUNK, rays)):
-            first = last
-            while last < len(measured.ray) and measured.ray[last] == o:
-                last += 1
-            for which in range(2 if behind[o] >= 0 else 1):
-                row = o if which == 0 else behind[o]
-                g_share[row] = _ZERO
-                g_normals[row] = _ZERO
-                g_material[row] = _ZERO
-                share = mirrors.share[row]
-                if share <= _ZERO:
-                    continue
-                gate = _sigmoid(raw[row, 0])
-                alpha = _LEAST + (_ONE - _LEAST) * gate
-                square, c = alpha * alpha, _f(0.5) * alpha
-                strength, slope = _softplus(raw[row, 1]), _sigmoid(raw[row, 1])
-                g_alpha, g_polarizing, polarizing = _ZERO, _ZERO, _sigmoid(raw[row, 4])
-                if last > bright:
-                    _around(row, mirrors, terms)
-                    wx, wy, wz = terms[0], terms[1], terms[2]
-                    mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
-                    light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
-                    gwx, gwy, gwz, whole, turned = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
-                    for m in range(first, last):
-                        ex, ey, ez = measured.axes[m - bright, 0], measured.axes[m - bright, 1], measured.axes[m - bright, 2]
-                        e = wx * ex + wy * ey + wz * ez
-                        whole += _f(0.5) * g[m]
-                        turned += _f(0.5) * g[m] * (_TWO * e * e - terms[3])
-                        gwx += g[m] * (_TWO * e * ex - wx)
-                        gwy += g[m] * (_TWO * e * ey - wy)
-                        gwz += g[m] * (_TWO * e * ez - wz)
-                    g_share[row] += whole * light + turned * polarized
-                    g_material[row, 2] += share * (whole + turned * terms[5]) * terms[4] * _sigmoid(raw[row, 2])
-                    g_material[row, 3] += share * (whole - turned * terms[6]) * _sigmoid(raw[row, 3])
-                    # w = v × n
-                    vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
-                    pull = share * polarized
-                    g_normals[row, 0] += pull * (gwy * vz - gwz * vy)
-                    g_normals[row, 1] += pull * (gwz * vx - gwx * vz)
-                    g_normals[row, 2] += pull * (gwx * vy - gwy * vx)
-                for k in range(count):
-                    visible = _sigmoid(raw[row, 5 + k])
-                    _terms(row, k, lamps, mirrors, last > bright, terms)
-                    amount = _amount(alpha, strength, visible, terms)
-                    pull, degree = _ZERO, terms[20]
-                    if last > bright:
-                        terms[20] *= polarizing
-                    for m in range(first, last):
-                        passed = g[m]
-                        if m >= bright:
-                            passed *= _passed(terms, measured.axes, m - bright)
-                            e = terms[17] * measured.axes[m - bright, 0] + terms[18] * measured.axes[m - bright, 1]
-                            e += terms[19] * measured.axes[m - bright, 2]
-                            turned = g[m] * lamps.spectrum[k, measured.output[m]] * _f(0.5) * degree * (_TWO * e * e - _ONE)
-                            g_polarizing += share * amount * turned
-                        pull += passed * lamps.spectrum[k, measured.output[m]]
-                        g_spectrum[chunk, k, measured.output[m]] += passed * share * amount
-                    g_share[row] += pull * amount
-                    if terms[16] == _ZERO:
-                        continue
-                    pull *= share
-                    rest = terms[16] * strength * visible
-                    off, nl, nv, a, b = terms[11], terms[12], terms[13], terms[14], terms[15]
-                    under = square + (_ONE - square) * off
-                    u = square / under
-                    lobe, seen = u * u, nl / (a * b)
-                    g_material[row, 1] += pull * terms[16] * visible * lobe * seen * slope
-                    g_material[row, 5 + k] += pull * rest * lobe * seen * (_ONE - visible)
-                    g_off = -pull * rest * seen * _TWO * lobe * (_ONE - square) / under
-                    g_square = pull * rest * seen * _TWO * u * off / (under * under)
-                    g_nl = pull * rest * lobe * c / (a * a * b) if nl > _ZERO else _ZERO
-                    g_nv = -pull * rest * lobe * nl * (_ONE - c) / (a * b * b) if nv > _ZERO else _ZERO
-                    g_c = -pull * rest * lobe * nl * ((_ONE - nl) / (a * a * b) + (_ONE - nv) / (a * b * b))
-                    g_alpha += g_square * _TWO * alpha + _f(0.5) * g_c
-                    nx, ny, nz = mirrors.normals[row, 0], mirrors.normals[row, 1], mirrors.normals[row, 2]
-                    tx, ty, tz, hx, hy, hz = terms[0], terms[1], terms[2], terms[4], terms[5], terms[6]
-                    wx, wy, wz = terms[8], terms[9], terms[10]
-                    q = _TWO * g_off
-                    # |n × h|²: to n it is 2 h × (n × h), to h 2 (n × h) × n
-                    g_normals[row, 0] += q * (hy * wz - hz * wy) + g_nl * tx - g_nv * mirrors.directions[row, 0]
-                    g_normals[row, 1] += q * (hz * wx - hx * wz) + g_nl * ty - g_nv * mirrors.directions[row, 1]
-                    g_normals[row, 2] += q * (hx * wy - hy * wx) + g_nl * tz - g_nv * mirrors.directions[row, 2]
-                    ghx, ghy, ghz = q * (wy * nz - wz * ny), q * (wz * nx - wx * nz), q * (wx * ny - wy * nx)
-                    along = ghx * hx + ghy * hy + ghz * hz
-                    gtx = g_nl * nx + (ghx - along * hx) / terms[7]
-                    gty = g_nl * ny + (ghy - along * hy) / terms[7]
-                    gtz = g_nl * nz + (ghz - along * hz) / terms[7]
-                    along = gtx * tx + gty * ty + gtz * tz
-                    g_position[chunk, k, 0] += (gtx - along * tx) / terms[3]
-                    g_position[chunk, k, 1] += (gty - along * ty) / terms[3]
-                    g_position[chunk, k, 2] += (gtz - along * tz) / terms[3]
-                g_material[row, 4] = g_polarizing * polarizing * (_ONE - polarizing)
-                g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate * (_ONE - gate)
+        mirror_rays_backward(begin, min(begin + CHUNK, rays), np.int64(0), chunk, lamps, mirrors, behind, measured, g, out)

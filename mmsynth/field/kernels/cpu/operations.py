@@ -16,21 +16,39 @@ from torch import Tensor
 
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
-from mmsynth.field.kernels.cpu import marching, mirroring, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
-from mmsynth.field.kernels.cpu.stores import RayStore, SurfaceStore, ray_store, shading_store, surface_store
+from mmsynth.field.kernels.cpu.slopes import TapStore
+from mmsynth.field.kernels.cpu.stores import (
+    RayStore,
+    SurfaceStore,
+    chunk_scratch,
+    light_out,
+    ray_store,
+    shading_store,
+    surface_store,
+    table_store,
+    tap_store,
+)
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.parameters import (
+    Eikonal,
+    Gains,
     GridTable,
     Hits,
     Lamps,
+    Learned,
+    LightNetwork,
     Measured,
     Mirrors,
+    Opacities,
     Rays,
     Sampling,
     ShadedRays,
     ShaderWeights,
     SurfaceNetwork,
+    View,
 )
 
 P = TypeVar("P", bound=tuple[Any, ...])
@@ -79,9 +97,17 @@ def _kept(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def _summed(arrays: SurfaceStore | RayStore, chunks: int) -> tuple[Tensor, Tensor]:
-    """Gradients of a network's weights."""
-    return torch.from_numpy(arrays.hidden_out[:chunks].sum(0)), torch.from_numpy(arrays.output_out[:chunks].sum(0))
+def _of_weights(arrays: SurfaceStore | RayStore | TableStore | TapStore, chunks: int, like: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients of a network's hidden layer, which is like this one, and of its last."""
+    units, inputs = like.shape
+    output = arrays.output_out[:chunks].sum(0)
+    return arrays.turned_out[:chunks].sum(0)[:inputs, :units].T, np.append(output[:units], output[-1])
+
+
+def _summed(arrays: SurfaceStore | RayStore, chunks: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """The same for autograd."""
+    hidden, output = _of_weights(arrays, chunks, like)
+    return torch.from_numpy(np.ascontiguousarray(hidden)), torch.from_numpy(output)
 
 
 def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
@@ -95,7 +121,7 @@ class _Value(torch.autograd.Function):
     def forward(
         ctx: Any, keep: bool, positions: Tensor, grid: GridTable, network: SurfaceNetwork, hidden: Tensor, output: Tensor
     ) -> Tensor:
-        store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), *hidden.shape)
+        store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), len(hidden), len(grid.resolutions))
         out = torch.empty(len(positions))
         surface.surface_forward(_array(positions), _arrays(grid), _arrays(network), keep, store.arrays, out.numpy())
         if keep:
@@ -117,7 +143,7 @@ class _Value(torch.autograd.Function):
         if grid.table.requires_grad:
             surface.surface_scatter(count, table, arrays, _table_gradient(grid.table))
         ctx.store = None
-        return None, positions, None, None, *_summed(arrays, -(-count // POINTS))
+        return None, positions, None, None, *_summed(arrays, -(-count // POINTS), hidden)
 
 
 def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
@@ -142,8 +168,7 @@ class _Trace(torch.autograd.Function):
         grid, network, appearance, states, rays, sampling = parameters
         count, levels = len(origins), len(appearance.resolutions)
         chunks = -(-count // CHUNK)
-        units, width = hidden.shape
-        store = ray_store(chunks if keep else get_num_threads(), units, width, levels)
+        store = ray_store(chunks if keep else get_num_threads(), len(hidden), len(grid.resolutions), levels)
         features = torch.empty(2, count, FEATURES * levels)
         weight, distance, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
@@ -181,7 +206,7 @@ class _Trace(torch.autograd.Function):
             gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
             tracing_gradients.trace_scatter(count, table, look, arrays, *gradients)
         ctx.store = None
-        return None, *to_rays, *_summed(arrays, -(-count // CHUNK)), None
+        return None, *to_rays, *_summed(arrays, -(-count // CHUNK), hidden), None
 
 
 def compare(
@@ -274,3 +299,87 @@ class _Mirror(torch.autograd.Function):
             mirroring.Gradients(*(x.numpy() for x in (*of_rows, *of_lamps))),
         )  # fmt: skip
         return None, None, None, *(x.sum(0) for x in of_lamps), *of_rows
+
+
+@torch.no_grad()
+def learn(
+    grid: GridTable,
+    network: SurfaceNetwork,
+    appearance: GridTable,
+    states: Tensor,
+    shader: ShaderWeights,
+    light: LightNetwork,
+    far_light: Tensor,
+    rays: Rays,
+    view: View,
+    measured: Measured,
+    gains: Gains,
+    opacities: Opacities,
+    eikonal: Eikonal,
+    sampling: Sampling,
+) -> Learned:
+    """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
+    count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
+    chunks, threads = -(-count // CHUNK), get_num_threads()
+    tasks = chunks + -(-points // slopes.POINTS)
+    units, levels = len(network.hidden), len(grid.resolutions)
+    features, hidden = FEATURES * len(appearance.resolutions), len(light.first)
+    used = light.used.numpy()
+    parts = len(light.second_bias) - len(light.position)
+    columns = np.concatenate([np.arange(parts), parts + used])
+    lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
+    shining = _arrays(light._replace(second=light.second[columns], second_bias=light.second_bias[columns]))
+    gain = np.empty(0, np.float32)
+    if len(gains.log_gain):
+        of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
+        gain = of_frames[gains.frame.numpy()]
+    store, taps = ray_store(threads, units, levels, len(appearance.resolutions)), tap_store(tasks, units, levels)
+    kept = table_store(chunks, units, levels, len(appearance.resolutions))
+    weights = shading_store(max(chunks, threads), shader)
+    scratch = chunk_scratch(threads, units, features, len(columns), hidden)
+    out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
+    squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
+    g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
+    next_task = np.zeros(1, np.int64)
+    table, look = _arrays(grid), _arrays(appearance)
+    learning.learn_rays(
+        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining,
+        lamps,
+        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays,
+        taps.arrays,
+        weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
+    )  # fmt: skip
+    gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
+    learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
+    for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
+        for weight, gradient in zip((network.hidden, network.output), _of_weights(arrays, parts, network.hidden), strict=True):
+            _add_gradient(weight, gradient)
+    for name, weight in shader._asdict().items():
+        whole = getattr(weights.arrays, f"{name}_out")[:chunks].sum(0)
+        _add_gradient(weight, whole[tuple(slice(n) for n in weight.shape)])
+    found = out.arrays
+    if len(used):
+        _add_gradient(light.first, found.first[:chunks].sum(0)[:hidden, :features])
+        _add_gradient(light.first_bias, found.first_bias[:chunks].sum(0)[:hidden])
+        _add_gradient(light.second, found.second[:chunks].sum(0)[: len(columns), :hidden], columns)
+        _add_gradient(light.second_bias, found.second_bias[:chunks].sum(0), columns)
+        _add_gradient(light.position, found.position[:chunks].sum(0), used)
+        _add_gradient(light.log_spectrum, found.spectrum[:chunks].sum(0) * lamps.spectrum, used)
+    if len(far_light):
+        _add_gradient(far_light, found.far[:chunks].sum(0))
+    if len(gain):
+        by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
+        _add_gradient(gains.log_gain, (by_frame - by_frame.mean()).astype(np.float32))
+    loss = torch.tensor(found.loss[:tasks].sum(), dtype=torch.float32)
+    return Learned(loss, torch.from_numpy(squared), torch.tensor(samples.sum()))
+
+
+def _add_gradient(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray | None = None) -> None:
+    """To ``tensor.grad``, or some of its rows."""
+    if tensor.grad is None:
+        tensor.grad = torch.zeros_like(tensor)
+    grad = tensor.grad.numpy()
+    if rows is None:
+        grad += gradient
+    else:
+        grad[rows] += gradient

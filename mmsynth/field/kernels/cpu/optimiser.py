@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit, prange, types
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 from torch import Tensor
 
+from mmsynth.field.kernels.cpu.tasks import take
 from mmsynth.field.kernels.parameters import AdamStep
 
 ADAM_CHUNK = 16384  # parameters at a time
@@ -31,20 +35,60 @@ def adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: i
         g[i] = zero
 
 
+@intrinsic
+def _at(typingctx, address, count):  # type: ignore[no-untyped-def]
+    """So many float32 at an address."""
+    kind = types.Array(types.float32, 1, "C")
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        array = context.make_array(kind)(context, builder)
+        data = builder.inttoptr(args[0], context.get_value_type(types.float32).as_pointer())
+        four = context.get_constant(types.intp, 4)
+        populate_array(array, data=data, shape=[args[1]], strides=[four], itemsize=four, meminfo=None)
+        return array._getvalue()
+
+    return kind(types.int64, types.int64), codegen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take_parts(next_task, places, numbers):  # type: ignore[no-untyped-def]
+    while True:
+        task = take(next_task, 0)
+        if task >= len(places):
+            return
+        count = places[task, 4]
+        p, g, m, v = _at(places[task, 0], count), _at(places[task, 1], count), _at(places[task, 2], count), _at(places[task, 3], count)
+        rate, beta1, beta2, root, epsilon = numbers[task]
+        adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon, places[task, 5] != 0)
+
+
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def adam_parts(p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
-    """``adam_part`` of many parameters."""
-    count = p.shape[0]
-    for chunk in prange((count + ADAM_CHUNK - 1) // ADAM_CHUNK):
-        begin = np.int64(chunk) * ADAM_CHUNK
-        end = min(count, begin + ADAM_CHUNK)
-        adam_part(p[begin:end], g[begin:end], m[begin:end], v[begin:end], rate, beta1, beta2, root, epsilon, sparse)
+def adam_parts(threads, next_task, places, numbers):  # type: ignore[no-untyped-def]
+    """``adam_part`` of many tensors, in parts. places: (N, 6) addresses of parameters, gradients and moments, how many, whether sparse;
+    numbers: N tuples of the others."""
+    next_task[0] = 0
+    for _ in prange(threads):
+        _take_parts(next_task, places, numbers)
+
+
+def _numbers(step: AdamStep) -> tuple[np.float32, ...]:
+    f = np.float32
+    root = f(1 / math.sqrt(1 - step.beta2**step.number))
+    return f(step.rate / (1 - step.beta1**step.number)), f(step.beta1), f(step.beta2), root, f(step.epsilon)
 
 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """See ``reference.adam``; float32."""
-    arrays = (x.detach().view(-1).numpy() for x in (parameter, gradient, first, second))
-    f = np.float32
-    rate, beta1, beta2, epsilon, count, sparse = step
-    parts = adam_parts if parameter.numel() > ADAM_CHUNK else adam_part  # to wake the other threads would take longer than the work
-    parts(*arrays, f(rate / (1 - beta1**count)), f(beta1), f(beta2), f(1 / math.sqrt(1 - beta2**count)), f(epsilon), sparse)  # type: ignore[call-arg]
+    adam_together([(parameter, gradient, first, second, step)])
+
+
+def adam_together(parts: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, AdamStep]]) -> None:
+    """``adam`` of many tensors at once; float32, contiguous."""
+    places, numbers = [], []
+    for *tensors, step in parts:
+        addresses, count, of_step = [x.data_ptr() for x in tensors], tensors[0].numel(), _numbers(step)
+        for begin in range(0, count, ADAM_CHUNK):
+            places.append((*(a + 4 * begin for a in addresses), min(ADAM_CHUNK, count - begin), step.sparse))
+            numbers.append(of_step)
+    if places:
+        adam_parts(get_num_threads(), np.zeros(1, np.int64), np.array(places, np.int64), np.array(numbers, np.float32))

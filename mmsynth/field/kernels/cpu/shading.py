@@ -4,7 +4,7 @@ Work is cut into chunks of ``CHUNK`` rays; what they meet passes the layers of t
 needs few of the shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights
 are summed per chunk and the chunks in order, whatever the number of threads.
 
-Matrices have whole tiles: they are padded with zeros, rows to a multiple of ``TILE_ROWS``, columns to one of ``TILE_COLS``.
+Matrices have whole tiles, see ``matrices``: they are padded with zeros.
 """
 
 from __future__ import annotations
@@ -13,89 +13,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import get_thread_id, njit, prange, types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba import get_thread_id, njit, prange
 
 from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
-from mmsynth.field.kernels.cpu.blocks import splat
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
 
 CHUNK = 64  # rays
-TILE_ROWS, TILE_COLS = 4, 16
 _HUBER = np.float32(HUBER_DELTA)
 _FAST = {"contract", "reassoc", "nsz", "arcp"}  # but NaN stays NaN: a loss that is not finite must be seen
-_VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
-_BYTE, _I64 = ir.IntType(8), ir.IntType(64)
-
-
-@intrinsic
-def _add_tile(typingctx, a, b, out, row, inner, column):  # type: ignore[no-untyped-def]
-    """out += a @ b, for the tile of ``out`` that begins at (row, column). Its sums stay in registers: LLVM would not find that."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        row, inner, column = args[3:]
-        zero = ir.Constant(_I64, 0)
-        rows = [ir.Constant(_I64, r) for r in range(TILE_ROWS)]
-
-        def element(which, i, j):  # type: ignore[no-untyped-def]
-            """Address of an element, and its array's strides."""
-            array = context.make_array(signature.args[which])(context, builder, args[which])
-            strides = cgutils.unpack_tuple(builder, array.strides, 2)
-            data = builder.bitcast(array.data, _BYTE.as_pointer())
-            return builder.gep(data, [builder.add(builder.mul(i, strides[0]), builder.mul(j, strides[1]))]), *strides
-
-        def after(address, stride, count, kind):  # type: ignore[no-untyped-def]
-            return builder.bitcast(builder.gep(address, [builder.mul(stride, count)]), kind.as_pointer())
-
-        left, down, along = element(0, row, zero)
-        right, onward, _ = element(1, zero, column)
-        tile, across, _ = element(2, row, column)
-        targets = [after(tile, across, r, _VECTOR) for r in rows]
-        sums = [cgutils.alloca_once_value(builder, builder.load(target, align=4)) for target in targets]
-        with cgutils.for_range(builder, inner) as loop:
-            vector = builder.load(after(right, onward, loop.index, _VECTOR), align=4)
-            values = builder.gep(left, [builder.mul(along, loop.index)])
-            for r, total in zip(rows, sums, strict=True):
-                value = splat(builder, builder.load(after(values, down, r, ir.FloatType())), _VECTOR)
-                product = builder.fmul(value, vector, flags=("contract",))
-                builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
-        for target, total in zip(targets, sums, strict=True):
-            builder.store(builder.load(total), target, align=4)
-        return context.get_dummy_value()
-
-    return types.void(a, b, out, row, inner, column), codegen
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def]
-    """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
-    for row in range(0, rows, TILE_ROWS):
-        for column in range(0, columns, TILE_COLS):
-            _add_tile(a, b, out, row, inner, column)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _clear(out, rows, columns):  # type: ignore[no-untyped-def]
-    for i in range(rows):
-        for j in range(columns):
-            out[i, j] = np.float32(0.0)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _whole(count, of):  # type: ignore[no-untyped-def]
-    """``count`` rounded up to a multiple."""
-    return (count + of - 1) // of * of
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _padded(matrix):  # type: ignore[no-untyped-def]
-    """A copy of whole tiles, whichever way round it is used."""
-    out = np.zeros((_whole(matrix.shape[0], TILE_COLS), _whole(matrix.shape[1], TILE_COLS)), np.float32)
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            out[i, j] = matrix[i, j]
-    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -128,14 +53,14 @@ def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
-def _layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
+def layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
     """out = rectified (x @ weight + bias), of n rays. weight: (inputs, units)."""
-    rows, units = _whole(n, TILE_ROWS), out.shape[1]
-    _clear(out, rows, units)
+    rows, units = whole(n, TILE_ROWS), out.shape[1]
+    clear(out, rows, units)
     for i in range(n):
         for k in range(len(bias)):
             out[i, k] = bias[k]
-    _add_product(x, weight, out, rows, inputs, units)
+    add_product(x, weight, out, rows, inputs, units)
     for i in range(n):
         for k in range(units):
             v = out[i, k]
@@ -143,14 +68,14 @@ def _layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
-def _layer_backward(n, x, inputs, g, out, weight_out, bias_out):  # type: ignore[no-untyped-def]
+def layer_backward(n, x, inputs, g, out, weight_out, bias_out):  # type: ignore[no-untyped-def]
     """Gradients of a layer's weights (units, inputs); g: those of what came out, then those before the rectification."""
     units = g.shape[1]
     for i in range(n):
         for k in range(units):
             g[i, k] = g[i, k] if out[i, k] > np.float32(0.0) else np.float32(0.0)
             bias_out[k] += g[i, k]
-    _add_product(g.T, x, weight_out, units, n, inputs)
+    add_product(g.T, x, weight_out, units, n, inputs)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -178,26 +103,24 @@ def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
 def _measurements(  # type: ignore[no-untyped-def]
-    begin, span, first, hidden, rays, measured, gain, mirrored, heads, heads_bias, learn, squared, g_hidden, g_share, g_gain, g_mirrored,
-    heads_out, heads_bias_out,
+    ray0, span, place_of, share, hidden, trains, measured, gain, mirrored, heads, heads_bias, learn, squared, g_hidden, g_share, g_gain,
+    g_mirrored, heads_out, heads_bias_out,
 ):  # fmt: skip
-    """What was measured along the rays of a chunk, of which ``begin`` is the first: the loss. Gradients are added to.
+    """What was measured along the rays of a chunk, of which ``ray0`` is the first: the loss. Gradients are added to.
 
-    span: of the measurements, the first and where they end. hidden: (n, H), a row per surface; what is behind a ray is at its row less
-    ``first``.
+    span: of the measurements, the first and where they end. hidden: (n, H), share, g_share (n,): a row per surface, those nearest first;
+    place_of: of each ray, the row of what is behind that, -1 = nothing. trains: of each ray.
     """
-    share, behind, trains_geometry = rays.share, rays.behind, rays.trains_geometry
     target, ray, output, axes, level = measured.target, measured.ray, measured.output, measured.axes, measured.level
     raw, slope = np.empty(6, np.float32), np.empty((2, 6), np.float32)
-    lights, places, rows = np.empty(2, np.float32), np.empty(2, np.int64), np.empty(2, np.int64)
+    lights, places = np.empty(2, np.float32), np.empty(2, np.int64)
     bright = len(ray) - len(axes)
     units = heads.shape[1]
     loss = 0.0
     for m in range(span[0], span[1]):
-        o, column = ray[m], output[m]
-        places[0], rows[0] = o - begin, o
-        places[1], rows[1] = behind[o] - first, behind[o]
-        surfaces = 2 if behind[o] >= 0 else 1
+        o, column = ray[m] - ray0, output[m]
+        places[0], places[1] = o, place_of[o]
+        surfaces = 2 if place_of[o] >= 0 else 1
         outputs = 1 if m < bright else 6
         seen = mirrored[m] if len(mirrored) else np.float32(0.0)
         for a in range(surfaces):
@@ -212,7 +135,7 @@ def _measurements(  # type: ignore[no-untyped-def]
                 lights[a], slope[a, 0] = _softplus(raw[0])
             else:
                 lights[a] = _intensity(raw, axes[m - bright], slope[a])
-            seen += lights[a] * share[rows[a]]
+            seen += lights[a] * share[places[a]]
         brightness = level[m]  # of what is fully seen
         if len(gain):
             brightness *= gain[m]
@@ -234,15 +157,15 @@ def _measurements(  # type: ignore[no-untyped-def]
             g_mirrored[m] = pull * brightness
         for a in range(surfaces):
             h, g = hidden[places[a]], g_hidden[places[a]]
-            if trains_geometry[o]:
-                g_share[rows[a]] += pull * lights[a] * brightness
+            if trains[o]:
+                g_share[places[a]] += pull * lights[a] * brightness
             for j in range(outputs):
                 w, w_out = heads[column + j], heads_out[column + j]
-                p = pull * brightness * share[rows[a]] * slope[a, j]
+                p = pull * brightness * share[places[a]] * slope[a, j]
                 heads_bias_out[column + j] += p
                 for k in range(units):
                     w_out[k] += p * h[k]
-                if trains_geometry[o]:
+                if trains[o]:
                     for k in range(units):
                         g[k] += p * w[k]
     return loss
@@ -273,54 +196,62 @@ class Layers(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _chunk(  # type: ignore[no-untyped-def]
-    begin, count, slot, chunk, rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, squared, g_features, g_share,
+def clear_gradients(store, chunk):  # type: ignore[no-untyped-def]
+    """Of weights, of one chunk."""
+    store.first_out[chunk], store.second_out[chunk], store.heads_out[chunk] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    store.first_bias_out[chunk], store.second_bias_out[chunk] = np.float32(0.0), np.float32(0.0)
+    store.heads_bias_out[chunk] = np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def compare_rays(  # type: ignore[no-untyped-def]
+    begin, count, ray0, slot, chunk, rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, squared, g_features, g_share,
     g_gain, g_mirrored,
 ):  # fmt: skip
-    """The loss of some rays, and its gradients where ``learn``. What is behind these rays are rows that follow each other."""
+    """The loss of some rays, at most ``CHUNK``, and its gradients where ``learn``: of weights they are added to.
+
+    begin: the first of the rays, ray0 + begin in ``measured.ray``.
+    """
     x, h1, h2, g1, g2 = store.x[slot], store.h1[slot], store.h2[slot], store.g1[slot], store.g2[slot]
     first_out, first_bias_out, second_out = store.first_out[chunk], store.first_bias_out[chunk], store.second_out[chunk]
     second_bias_out, heads_out, heads_bias_out = store.second_bias_out[chunk], store.heads_out[chunk], store.heads_bias_out[chunk]
     features, directions, degrees, behind = rays.features, rays.directions, rays.degrees, rays.behind
     width = features.shape[1]
-    degree, n, first = np.int64(0), np.int64(count), np.int64(0)
-    ray_of, row_of = np.empty(2 * CHUNK, np.int64), np.empty(2 * CHUNK, np.int64)
+    degree, n = np.int64(0), np.int64(count)
+    ray_of, row_of, place_of = np.empty(2 * CHUNK, np.int64), np.empty(2 * CHUNK, np.int64), np.empty(CHUNK, np.int64)
+    share, g_of = np.empty(2 * CHUNK, np.float32), np.zeros(2 * CHUNK, np.float32)
     for i in range(count):
         degree = max(degree, degrees[begin + i])  # terms of a higher one than any here are zero
-        ray_of[i], row_of[i] = begin + i, begin + i
+        ray_of[i], row_of[i], place_of[i] = begin + i, begin + i, -1
         if behind[begin + i] >= 0:
-            if n == count:
-                first = behind[begin + i] - n
-            ray_of[n], row_of[n] = begin + i, behind[begin + i]
+            ray_of[n], row_of[n], place_of[i] = begin + i, behind[begin + i], n
             n += 1
-    rows, inputs, used = _whole(n, TILE_ROWS), _whole(width + (HARMONICS if degree else 1), TILE_COLS), _whole(width, TILE_COLS)
+    rows, inputs, used = whole(n, TILE_ROWS), whole(width + (HARMONICS if degree else 1), TILE_COLS), whole(width, TILE_COLS)
     units = h1.shape[1]
-    _clear(x, rows, inputs)
-    _clear(g2, rows, units)
+    clear(x, rows, inputs)
+    clear(g2, rows, units)
     for i in range(n):
         o, row = ray_of[i], row_of[i]
         for j in range(width):
             x[i, j] = features[row, j]
         _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degrees[o], x[i, width:])
-        g_share[row] = np.float32(0.0)
-    _layer(n, x, inputs, layers.first_turned, layers.first_bias, h1)
-    _layer(n, h1, units, layers.second_turned, layers.second_bias, h2)
-    if learn:
-        first_out[:], second_out[:], heads_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        first_bias_out[:], second_bias_out[:], heads_bias_out[:] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    span = first_at(measured.ray, begin), first_at(measured.ray, begin + count)
+        share[i] = rays.share[row]
+    layer(n, x, inputs, layers.first_turned, layers.first_bias, h1)
+    layer(n, h1, units, layers.second_turned, layers.second_bias, h2)
+    span = first_at(measured.ray, ray0 + begin), first_at(measured.ray, ray0 + begin + count)
     loss = _measurements(
-        begin, span, first, h2, rays, measured, gain, mirrored, heads, heads_bias, learn, squared, g2, g_share, g_gain, g_mirrored,
-        heads_out, heads_bias_out,
+        ray0 + begin, span, place_of, share, h2, rays.trains_geometry[begin : begin + count], measured, gain, mirrored, heads, heads_bias,
+        learn, squared, g2, g_of, g_gain, g_mirrored, heads_out, heads_bias_out,
     )  # fmt: skip
     if learn:
-        _layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
-        _clear(g1, rows, units)
-        _add_product(g2, layers.second, g1, rows, units, units)
-        _layer_backward(n, x, inputs, g1, h1, first_out, first_bias_out)
-        _clear(x, rows, used)
-        _add_product(g1, layers.first, x, rows, units, used)
+        layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
+        clear(g1, rows, units)
+        add_product(g2, layers.second, g1, rows, units, units)
+        layer_backward(n, x, inputs, g1, h1, first_out, first_bias_out)
+        clear(x, rows, used)
+        add_product(g1, layers.first, x, rows, units, used)
         for i in range(n):
+            g_share[row_of[i]] = g_of[i]
             for j in range(width):
                 g_features[row_of[i], j] = x[i, j]
     return loss
@@ -337,15 +268,16 @@ def compare(  # type: ignore[no-untyped-def]
     """
     total = len(rays.behind)
     layers = Layers(
-        _padded(weights.first), _padded(weights.first.T), weights.first_bias,
-        _padded(weights.second), _padded(weights.second.T), weights.second_bias,
+        padded(weights.first), padded(weights.first.T), weights.first_bias,
+        padded(weights.second), padded(weights.second.T), weights.second_bias,
     )  # fmt: skip
     for task in prange((total + CHUNK - 1) // CHUNK):
         chunk, slot = np.int64(task), np.int64(get_thread_id())
         begin = chunk * CHUNK
-        loss[chunk] = _chunk(
-            begin, min(CHUNK, total - begin), slot, chunk, rays, measured, gain, mirrored, layers, weights.heads, weights.heads_bias,
-            learn, store, squared, g_features, g_share, g_gain, g_mirrored,
+        clear_gradients(store, chunk)
+        loss[chunk] = compare_rays(
+            begin, min(CHUNK, total - begin), np.int64(0), slot, chunk, rays, measured, gain, mirrored, layers, weights.heads,
+            weights.heads_bias, learn, store, squared, g_features, g_share, g_gain, g_mirrored,
         )  # fmt: skip
 
 
@@ -353,7 +285,7 @@ def compare(  # type: ignore[no-untyped-def]
 def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """Outputs of n rays. heads: (H, outputs), whole tiles."""
     first, second = layers.first_turned, layers.second_turned
-    width, rows = features.shape[1], _whole(n, TILE_ROWS)
+    width, rows = features.shape[1], whole(n, TILE_ROWS)
     x = np.zeros((rows, first.shape[0]), np.float32)
     h1, h2 = np.empty((rows, first.shape[1]), np.float32), np.empty((rows, second.shape[1]), np.float32)
     out = np.zeros((rows, heads.shape[1]), np.float32)
@@ -362,9 +294,9 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
         for j in range(width):
             x[i, j] = features[o, j]
         _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degree, x[i, width:])
-    _layer(n, x, _whole(width + (HARMONICS if degree else 1), TILE_COLS), first, layers.first_bias, h1)
-    _layer(n, h1, h1.shape[1], second, layers.second_bias, h2)
-    _add_product(h2, heads, out, rows, h2.shape[1], out.shape[1])
+    layer(n, x, whole(width + (HARMONICS if degree else 1), TILE_COLS), first, layers.first_bias, h1)
+    layer(n, h1, h1.shape[1], second, layers.second_bias, h2)
+    add_product(h2, heads, out, rows, h2.shape[1], out.shape[1])
     for i in range(n):
         for k in range(len(heads_bias)):
             outputs[begin + i, k] = out[i, k] + heads_bias[k]
@@ -375,9 +307,10 @@ def shade(features, directions, degree, weights, outputs):  # type: ignore[no-un
     """See ``reference.shade``, of rays that all have one degree."""
     rays = len(features)
     layers = Layers(
-        weights.first, _padded(weights.first.T), weights.first_bias, weights.second, _padded(weights.second.T), weights.second_bias
-    )
-    heads = _padded(weights.heads.T)
+        padded(weights.first), padded(weights.first.T), weights.first_bias,
+        padded(weights.second), padded(weights.second.T), weights.second_bias,
+    )  # fmt: skip
+    heads = padded(weights.heads.T)
     for task in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(task) * CHUNK
         _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, heads, weights.heads_bias, outputs)

@@ -7,33 +7,37 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from mmsynth.field.kernels.constants import FEATURES, MAX_SAMPLES_PER_RAY
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
 from mmsynth.field.kernels.cpu import shading
-from mmsynth.field.kernels.cpu.marching import CHUNK
+from mmsynth.field.kernels.cpu.learning import TableStore
+from mmsynth.field.kernels.cpu.marching import CAPACITY, CHUNK
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS
+from mmsynth.field.kernels.cpu.mirrors import ChunkScratch, LightOut
+from mmsynth.field.kernels.cpu.slopes import MOST_TAPPED, TapStore
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
-_POOLED = 6
+_POOLED = 12
+_TAPS = 4 * MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
 _pool: list[tuple[Any, Any]] = []
 
 
 class SurfaceStore(NamedTuple):
-    """Of positions: block, hidden (see ``blocks``), row (scratch), and the weights' gradients."""
+    """Of positions: block, hidden (see ``blocks``), and the weights' gradients."""
 
     block: np.ndarray
     hidden: np.ndarray
-    row: np.ndarray
-    hidden_out: np.ndarray
+    turned_out: np.ndarray
     output_out: np.ndarray
 
 
 class RayStore(NamedTuple):
     """Of rays. Per sample, in the order of the blocks: block, hidden, sdf, ray_of, time_of. Per ray and number of the sample
-    (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), id_of (place in the order of the blocks); counts: samples
-    of each ray; second: the sample at which its second surface begins; rounds, sizes: number and lengths of the blocks. Sections that
-    matter: s_block (position and features), s_ray, s_k (its first sample), s_time, s_weight, s_count. row: scratch; the
-    weights' gradients."""
+    (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), q_of (minus its slope over s), opacity_of (of the
+    section that begins there), id_of (place in the order of the blocks); counts: samples of each ray; second: the sample at which its
+    second surface begins; samples: of all. Sections that matter: s_block (a block, too), s_ray, s_k (its first sample), s_time, s_weight,
+    s_count. The weights' gradients."""
 
     block: np.ndarray
     hidden: np.ndarray
@@ -43,19 +47,19 @@ class RayStore(NamedTuple):
     t_of: np.ndarray
     f_of: np.ndarray
     p_of: np.ndarray
+    q_of: np.ndarray
+    opacity_of: np.ndarray
     id_of: np.ndarray
     counts: np.ndarray
     second: np.ndarray
-    rounds: np.ndarray
-    sizes: np.ndarray
+    samples: np.ndarray
     s_block: np.ndarray
     s_ray: np.ndarray
     s_k: np.ndarray
     s_time: np.ndarray
     s_weight: np.ndarray
     s_count: np.ndarray
-    row: np.ndarray
-    hidden_out: np.ndarray
+    turned_out: np.ndarray
     output_out: np.ndarray
 
 
@@ -98,33 +102,38 @@ class Store(Generic[S]):
             _pool.append((self.key, self.arrays))
 
 
-def surface_store(slots: int, units: int, width: int) -> Store[SurfaceStore]:
-    """Of a hidden layer of ``units`` times ``width`` weights."""
-    sizes: Sizes = {"block": (np.float32, (width * POINTS,)), "hidden": (np.float32, (units * POINTS,)), **_network(units, width)}
-    return Store(slots, SurfaceStore, sizes)
+def _whole(count: int) -> int:
+    return -(-count // TILE_COLS) * TILE_COLS
 
 
-def ray_store(slots: int, units: int, width: int, appearance_levels: int) -> Store[RayStore]:
+def _network(rows: int, units: int, levels: int) -> Sizes:
+    """Rows of blocks of so many levels, hidden units, and the weights' gradients."""
+    f, width, units = np.float32, FIRST_FEATURE_ROW + _whole(FEATURES * levels), _whole(units)
+    return {"block": (f, (rows, width)), "hidden": (f, (rows, units)), "turned_out": (f, (width, units)), "output_out": (f, (units + 1,))}
+
+
+def surface_store(slots: int, units: int, levels: int) -> Store[SurfaceStore]:
+    """Of a surface of so many hidden units and levels."""
+    return Store(slots, SurfaceStore, _network(POINTS, units, levels))
+
+
+def ray_store(slots: int, units: int, levels: int, appearance_levels: int) -> Store[RayStore]:
     """The same, of rays with an appearance."""
-    f, i, d = np.float32, np.int32, np.float64
-    most = CHUNK * MAX_SAMPLES_PER_RAY
+    f, i, d, most = np.float32, np.int32, np.float64, CAPACITY
     lengths: dict[str, tuple[type, int]] = {
-        "block": (f, width * most), "hidden": (f, units * most), "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most),
-        "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "id_of": (i, most),
-        "counts": (i, CHUNK), "second": (i, CHUNK), "rounds": (i, 1), "sizes": (i, most),
-        "s_block": (f, (3 + FEATURES * appearance_levels) * most), "s_ray": (i, most), "s_k": (i, most), "s_time": (f, most),
-        "s_weight": (f, most), "s_count": (i, 1),
+        "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most), "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "q_of": (d,
+        most), "opacity_of": (d, most),
+        "id_of": (i, most), "counts": (i, CHUNK), "second": (i, CHUNK), "samples": (i, 1), "s_ray": (i, most), "s_k": (i, most),
+        "s_time": (f, most), "s_weight": (f, most), "s_count": (i, 1),
     }  # fmt: skip
-    return Store(slots, RayStore, {**{name: (dtype, (n,)) for name, (dtype, n) in lengths.items()}, **_network(units, width)})
-
-
-def _network(units: int, width: int) -> Sizes:
-    return {"row": (np.float32, (POINTS,)), "hidden_out": (np.float32, (units, width)), "output_out": (np.float32, (units + 1,))}
+    sizes: Sizes = {name: (dtype, (n,)) for name, (dtype, n) in lengths.items()}
+    sizes["s_block"] = f, (most, FIRST_FEATURE_ROW + FEATURES * appearance_levels)
+    return Store(slots, RayStore, sizes | _network(most, units, levels))
 
 
 def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
     """Matrices have whole tiles."""
-    rows, columns = (-(-n // shading.TILE_COLS) * shading.TILE_COLS for n in weights.first.shape)
+    rows, columns = map(_whole, weights.first.shape)
     most = 2 * shading.CHUNK  # surfaces, of which a ray meets two at the most
     block, heads = (most, rows), weights.heads.shape
     shapes = {
@@ -133,3 +142,50 @@ def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
         "heads_out": tuple(heads), "heads_bias_out": (heads[0],),
     }  # fmt: skip
     return Store(slots, ShadingStore, {name: (np.float32, shape) for name, shape in shapes.items()})
+
+
+def tap_store(slots: int, units: int, levels: int) -> Store[TapStore]:
+    """Of points at which a surface of so many hidden units and levels is asked for its gradient."""
+    sizes = _network(_TAPS, units, levels)
+    del sizes["hidden"]
+    return Store(slots, TapStore, {"used": (np.int64, (1,)), **sizes})
+
+
+def table_store(slots: int, units: int, levels: int, appearance_levels: int) -> Store[TableStore]:
+    """Of the samples and sections of rays, of such a surface and an appearance of so many levels."""
+    sizes = _network(CAPACITY, units, levels)
+    del sizes["hidden"]
+    sizes["s_block"] = np.float32, (CAPACITY, FIRST_FEATURE_ROW + FEATURES * appearance_levels)
+    return Store(slots, TableStore, {"samples": (np.int64, (1,)), "sections": (np.int64, (1,)), **sizes})
+
+
+def chunk_scratch(slots: int, units: int, features: int, materials: int, hidden: int) -> Store[ChunkScratch]:
+    """Of a surface of so many hidden units, rays with so many features, numbers of a material and hidden units of its network."""
+    f, whole = np.float32, _whole
+    rows, columns = 2 * CHUNK, (2, CHUNK)
+    three, some = (f, (rows, 3)), 2 * shading.CHUNK
+    sizes: Sizes = {
+        "hidden": (f, (_TAPS, whole(units))),
+        "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f,
+        (CHUNK,)),
+        "behind": (np.int64, (CHUNK,)), "mixed": (f, (rows, features)), "mixed_share": (f, (rows,)), "g_features": (f, (rows, features)),
+        "g_share": (f, (rows,)), "material": (f, (rows, materials)), "normals": three, "points": three, "directions": three,
+        "slopes": three,
+        "g_material": (f, (rows, materials)), "g_normals": three, "mirror_share": (f, (rows,)), "g_mirror_share": (f, (rows,)),
+        "at": three, "found": three, "row_of": (np.int64, (rows,)), "shallow": (f, (rows,)),
+        "x": (f, (some, whole(features))), "h": (f, (some, whole(hidden))), "y": (f, (some, whole(materials))),
+        "gy": (f, (some, whole(materials))), "gh": (f, (some, whole(hidden))),
+    }  # fmt: skip
+    return Store(slots, ChunkScratch, sizes)
+
+
+def light_out(slots: int, features: int, materials: int, hidden: int, lamps: int, outputs: int) -> Store[LightOut]:
+    """Of chunks of such rays, K lamps and the shader's outputs."""
+    f, whole = np.float32, _whole
+    sizes: Sizes = {
+        "first": (f, (whole(hidden), whole(features))), "first_bias": (f, (whole(hidden),)), "second": (f, (whole(materials),
+        whole(hidden))),
+        "second_bias": (f, (materials,)), "position": (f, (lamps, 3)), "spectrum": (f, (lamps, outputs)), "far": (f, (features,)),
+        "loss": (np.float64, ()),
+    }  # fmt: skip
+    return Store(slots, LightOut, sizes)

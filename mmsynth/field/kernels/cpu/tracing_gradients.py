@@ -8,10 +8,72 @@ import numpy as np
 from numba import njit, prange
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, MAX_SAMPLES_PER_RAY
-from mmsynth.field.kernels.cpu.blocks import position_block, scatter_block, surface_block_backward, surface_block_positions
+from mmsynth.field.kernels.cpu.blocks import (
+    SurfaceLayers,
+    padded_output,
+    position_block,
+    scatter_block,
+    surface_block_backward,
+    surface_block_positions,
+)
 from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
+from mmsynth.field.kernels.cpu.matrices import padded_to
 
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store):  # type: ignore[no-untyped-def]
+    """Distances and features of the sections become their gradients, of the rays in a slot of the store, of which ``begin`` is the first in
+    ``behind``."""
+    sdf, q_of, opacity_of, id_of = store.sdf, store.q_of, store.opacity_of, store.id_of
+    sections = store.s_count[chunk, 0]
+    sf = store.s_block[chunk]
+    at = 0
+    g_section = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
+    for i in range(count):
+        o = begin + i
+        samples, second = store.counts[chunk, i], store.second[chunk, i]
+        for k in range(samples):
+            sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] = np.float32(0.0)
+            g_section[k] = g_weight[o if k < second else behind[o]]
+        while at < sections and store.s_ray[chunk, at] == i:
+            row = o if store.s_k[chunk, at] < second else behind[o]
+            scale = np.float32(1.0) / max(shown[row], _LEAST_WEIGHT)
+            g = g_weight[row]
+            w = store.s_weight[chunk, at] * scale
+            for j in range(FEATURES * a_active):
+                gf = g_features[row, j]
+                g += gf * scale * (sf[at, FIRST_FEATURE_ROW + j] - features[row, j])
+                sf[at, FIRST_FEATURE_ROW + j] = gf * w
+            g_section[store.s_k[chunk, at]] = g
+            at += 1
+        # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
+        first = i * MAX_SAMPLES_PER_RAY
+        total, transmittance = 0.0, 1.0
+        for k in range(samples - 1):
+            w = transmittance * opacity_of[chunk, first + k]
+            total += g_section[k] * w
+            transmittance -= w
+        transmittance = 1.0
+        for k in range(samples - 1):
+            opacity = opacity_of[chunk, first + k]
+            if opacity > 0.0:
+                w = transmittance * opacity
+                total -= g_section[k] * w
+                transmittance -= w
+                # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
+                d_tau = (g_section[k] * transmittance - total) * sharpness
+                sdf[chunk, id_of[chunk, first + k]] += np.float32(d_tau * q_of[chunk, first + k])
+                sdf[chunk, id_of[chunk, first + k + 1]] -= np.float32(d_tau * q_of[chunk, first + k + 1])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def samples_backward(block, hidden, g, samples, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
+    """``surface_block_backward`` of many samples, a part at a time."""
+    for used in range(0, samples, LANES):
+        n = np.int64(min(LANES, samples - used))
+        surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -23,83 +85,40 @@ def trace_backward(  # type: ignore[no-untyped-def]
     behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
     """
     rays = behind.shape[0]
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
-    units = network.hidden.shape[0]
-    sdf, p_of, id_of = store.sdf, store.p_of, store.id_of
-    hidden_out, output_out = store.hidden_out, store.output_out  # in a parallel loop, numba would not set a tuple's arrays
-    for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        begin = np.int64(chunk) * CHUNK
-        count = min(CHUNK, rays - begin)
-        hidden_out[chunk] = np.float32(0.0)
-        output_out[chunk] = np.float32(0.0)
-        sections = store.s_count[chunk, 0]
-        sf = store.s_block[chunk]
-        at = 0
-        g_section = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
-        for i in range(count):
-            o = begin + i
-            samples, second = store.counts[chunk, i], store.second[chunk, i]
-            for k in range(samples):
-                sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] = np.float32(0.0)
-                g_section[k] = g_weight[o if k < second else behind[o]]
-            while at < sections and store.s_ray[chunk, at] == i:
-                row = o if store.s_k[chunk, at] < second else behind[o]
-                scale = np.float32(1.0) / max(shown[row], _LEAST_WEIGHT)
-                g = g_weight[row]
-                w = store.s_weight[chunk, at] * scale
-                for j in range(FEATURES * a_active):
-                    place = (3 + j) * sections + at
-                    gf = g_features[row, j]
-                    g += gf * scale * (sf[place] - features[row, j])
-                    sf[place] = gf * w
-                g_section[store.s_k[chunk, at]] = g
-                at += 1
-            # d loss / d sdf through the weights: first the total of gradient times weight, then what is left behind each section
-            tau_sum = 0.0
-            total = 0.0
-            for k in range(samples - 1):
-                tau = max(0.0, p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1] - p_of[chunk, i * MAX_SAMPLES_PER_RAY + k])
-                total += g_section[k] * math.exp(-tau_sum) * -math.expm1(-tau)
-                tau_sum += tau
-            tau_sum = 0.0
-            for k in range(samples - 1):
-                p0, p1 = p_of[chunk, i * MAX_SAMPLES_PER_RAY + k], p_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]
-                tau = p1 - p0
-                if tau > 1e-7:
-                    transmittance = math.exp(-tau_sum)
-                    total -= g_section[k] * transmittance * -math.expm1(-tau)
-                    # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
-                    d_tau = g_section[k] * transmittance * math.exp(-tau) - total
-                    sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k]] += np.float32(d_tau * sharpness * -math.expm1(-p0))
-                    sdf[chunk, id_of[chunk, i * MAX_SAMPLES_PER_RAY + k + 1]] -= np.float32(d_tau * sharpness * -math.expm1(-p1))
-                    tau_sum += tau
-        used = 0
-        for b in range(store.rounds[chunk, 0]):
-            n = np.int64(store.sizes[chunk, b])
-            surface_block_backward(
-                store.block[chunk, used * size :], store.hidden[chunk, used * units :], sdf[chunk, used : used + n], n,
-                active, network, store.row[chunk], hidden_out[chunk], output_out[chunk],
-            )  # fmt: skip
-            used += int(n)
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    layers = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
+    for task in prange((rays + CHUNK - 1) // CHUNK):
+        chunk = np.int64(task)
+        begin = chunk * CHUNK
+        count, turned_out, output_out = min(CHUNK, rays - begin), store.turned_out[chunk], store.output_out[chunk]
+        rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store)
+        turned_out[:], output_out[:] = np.float32(0.0), np.float32(0.0)
+        samples_backward(
+            store.block[chunk],
+            store.hidden[chunk],
+            store.sdf[chunk],
+            np.int64(store.samples[chunk, 0]),
+            active,
+            layers,
+            turned_out,
+            output_out,
+        )
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def trace_scatter(rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
     chunks = (rays + CHUNK - 1) // CHUNK
     for each in prange(grid.active + appearance.active):
         task = np.int64(each)
-        if task < grid.active:
-            for chunk in range(chunks):
-                used = 0
-                for b in range(store.rounds[chunk, 0]):
-                    n = np.int64(store.sizes[chunk, b])
-                    scatter_block(store.block[chunk, used * size :], n, grid, gradient, task, FIRST_FEATURE_ROW)
-                    used += int(n)
-        else:
-            for chunk in range(chunks):
-                scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active, 3)
+        for chunk in range(chunks):
+            if task < grid.active:
+                scatter_block(store.block[chunk], np.int64(store.samples[chunk, 0]), grid, gradient, task)
+            else:
+                scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -117,8 +136,11 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
 def trace_rays_backward(origins, directions, grid, network, appearance, store, origins_out, directions_out):  # type: ignore[no-untyped-def]
     """After ``trace_backward``: gradients to origins and directions, with the samples' ray distances held fixed."""
     rays = origins.shape[0]
-    size = store.block.shape[1] // (CHUNK * MAX_SAMPLES_PER_RAY)
-    units = network.hidden.shape[0]
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    layers = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
     contracted = grid.extent > np.float32(1.0)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(chunk) * CHUNK
@@ -126,26 +148,21 @@ def trace_rays_backward(origins, directions, grid, network, appearance, store, o
             for a in range(3):
                 origins_out[o, a] = np.float32(0.0)
                 directions_out[o, a] = np.float32(0.0)
-        used = 0
-        sections = store.s_count[chunk, 0]
-        out = np.zeros(3 * max(np.int64(LANES), np.int64(sections)), np.float32)
-        for b in range(store.rounds[chunk, 0] + 1):
-            last = b == store.rounds[chunk, 0]
-            n = np.int64(sections if last else store.sizes[chunk, b])
+        samples, sections = np.int64(store.samples[chunk, 0]), np.int64(store.s_count[chunk, 0])
+        out = np.zeros((max(samples, sections), 3), np.float32)
+        for last in (False, True):
+            n = sections if last else samples
             if last:
-                out[: 3 * n] = np.float32(0.0)
-                position_block(store.s_block[chunk], n, appearance, 3, out)
+                out[:n] = np.float32(0.0)
+                position_block(store.s_block[chunk], n, appearance, out)
             else:
-                surface_block_positions(
-                    store.block[chunk, used * size :], store.hidden[chunk, used * units :], store.sdf[chunk, used : used + n], n,
-                    grid, network, out,
-                )  # fmt: skip
+                surface_block_positions(store.block[chunk], store.hidden[chunk], store.sdf[chunk], n, grid, layers, out)
             for i in range(n):
-                o = begin + (store.s_ray[chunk, i] if last else store.ray_of[chunk, used + i])
-                t = store.s_time[chunk, i] if last else store.time_of[chunk, used + i]
+                o = begin + (store.s_ray[chunk, i] if last else store.ray_of[chunk, i])
+                t = store.s_time[chunk, i] if last else store.time_of[chunk, i]
                 gx, gy, gz = _back_to_world(
                     origins[o, 0] + directions[o, 0] * t, origins[o, 1] + directions[o, 1] * t, origins[o, 2] + directions[o, 2] * t,
-                    out[i], out[n + i], out[2 * n + i], contracted,
+                    out[i, 0], out[i, 1], out[i, 2], contracted,
                 )  # fmt: skip
                 origins_out[o, 0] += gx
                 origins_out[o, 1] += gy
@@ -153,5 +170,3 @@ def trace_rays_backward(origins, directions, grid, network, appearance, store, o
                 directions_out[o, 0] += t * gx
                 directions_out[o, 1] += t * gy
                 directions_out[o, 2] += t * gz
-            if not last:
-                used += int(n)

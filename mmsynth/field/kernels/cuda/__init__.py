@@ -1,30 +1,25 @@
-"""The operations for NVIDIA GPUs, compiled by Triton; what is not is the reference's, made of these parts.
+"""The operations for NVIDIA GPUs, compiled by Triton; what is not is the reference's.
 
-All but the gradient of the hash table (see ``encoding``) is bit-deterministic: no atomics. The module imports anywhere; ``available`` says
-whether its operations can run. With TRITON_INTERPRET=1 in the environment before triton is first imported they run, slowly, on CPU
-tensors: that is how they are tested without a GPU.
+No operation waits for the device or asks it for a shape. All but the gradients of hash tables (see ``encoding``) and of exposures is
+bit-deterministic on one kind of GPU: no other sum uses atomics. The module imports anywhere; ``available`` says whether its operations can
+run. With TRITON_INTERPRET=1 in the environment before triton is first imported they run, slowly, on CPU tensors: that is how they are
+tested without a GPU.
 """
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
-
+from mmsynth.field.kernels.cuda.drawing import draw
 from mmsynth.field.kernels.cuda.encoding import hash_encode
-from mmsynth.field.kernels.cuda.marching import march
-from mmsynth.field.kernels.cuda.sections import section_weights
+from mmsynth.field.kernels.cuda.learning import learn
+from mmsynth.field.kernels.cuda.mirroring import mirror
+from mmsynth.field.kernels.cuda.optimiser import adam
+from mmsynth.field.kernels.cuda.shading import compare
 from mmsynth.field.kernels.cuda.shared import available
-from mmsynth.field.kernels.cuda.surface import surface_value
-from mmsynth.field.kernels.mirroring import mirror
-from mmsynth.field.kernels.parameters import GridTable, Hits, Rays, Sampling, SurfaceNetwork
-from mmsynth.field.kernels.reference import adam, compare, composite, shade
+from mmsynth.field.kernels.cuda.surface import surface_gradient, surface_value
+from mmsynth.field.kernels.cuda.tracing import trace
+from mmsynth.field.kernels.reference import march, odds, section_weights, shade
 
-__all__ = ["adam", "available", "compare", "hash_encode", "march", "mirror", "section_weights", "shade", "surface_value", "trace"]
-
-
-def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
-    """See ``reference.trace``; float32."""
-    sdf = lambda x: surface_value(x, grid, network)
-    with torch.no_grad():
-        samples = march(sdf, rays, states, grid.extent, sampling)
-    return composite(sdf, appearance, rays, samples, sampling, hash_encode, section_weights)
+__all__ = [
+    "adam", "available", "compare", "draw", "hash_encode", "learn", "march", "mirror", "odds", "section_weights", "shade",
+    "surface_gradient", "surface_value", "trace",
+]  # fmt: skip

@@ -1,8 +1,9 @@
-"""The multiresolution hash encoding in Triton.
+"""The multiresolution hash encoding in Triton: device functions that the fused kernels are made of, and the operation itself.
 
-It runs over (block of samples, group of levels), levels on the slow axis of the grid: the tables of one group stay in the L2 cache while
-all samples pass, and a sample's part of a group is one 32-byte sector. Its backward pass adds to the table with float32 atomics, whose
-order differs from run to run: gradients of the table are *not* bit-deterministic, by about float32 rounding.
+A program looks up ``COLUMNS`` features at a time, of a few levels, for a block of positions: all rows that they need are asked for at once,
+which hides the latency of memory, and the features of a row are one vector load. Tables may be of 16 bits, sums are of 32.
+Gradients are added to the table with float32 atomics, whose order differs from run to run: gradients of tables are *not*
+bit-deterministic, by about float32 rounding.
 """
 
 from __future__ import annotations
@@ -10,15 +11,44 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mmsynth.field.kernels.cuda.shared import HASH_Y, HASH_Z, jit, position, tl, triton
+from mmsynth.field.kernels.cuda.shared import COLUMNS, HASH_Y, HASH_Z, jit, position, tl, triton
 
-BLOCK = 128  # samples per program: one per thread at Triton's default of four warps
-_LEVELS = 2  # levels per program: with four features, the 32-byte sector of a sample's row, written and read as a whole
+BLOCK = 64  # positions per program: two threads each, at Triton's default of four warps
 
 
 @jit
-def _level(resolutions, offsets, level, used):  # type: ignore[no-untyped-def]
-    """Of one level: cells per axis, first row, whether it is dense, mask of the hash, and what a step along x, y, z multiplies."""
+def unit_cube(x, y, z, scale):  # type: ignore[no-untyped-def]
+    """From the frame of a grid to [0, 1]³; those outside go to its border."""
+    ux = tl.minimum(tl.maximum(x * scale + 0.5, 0.0), 1.0)
+    uy = tl.minimum(tl.maximum(y * scale + 0.5, 0.0), 1.0)
+    uz = tl.minimum(tl.maximum(z * scale + 0.5, 0.0), 1.0)
+    return ux, uy, uz
+
+
+@jit
+def to_frame(x, y, z, gx, gy, gz, scale):  # type: ignore[no-untyped-def]
+    """Gradient to positions of the frame of a grid from that to ``unit_cube`` of them: places outside have the features of its border."""
+    gx = tl.where(tl.abs(x * scale) < 0.5, gx * scale, 0.0)
+    gy = tl.where(tl.abs(y * scale) < 0.5, gy * scale, 0.0)
+    gz = tl.where(tl.abs(z * scale) < 0.5, gz * scale, 0.0)
+    return gx, gy, gz
+
+
+@jit
+def _axis(unit, resolution, step):  # type: ignore[no-untyped-def]
+    """Along one axis: the share of the cell's index in the row number, and where in the cell the position is."""
+    scaled = unit[:, None] * resolution
+    # NaN > 0 is false: even then the cell is within the table
+    base = tl.where(scaled > 0.0, tl.minimum(tl.floor(scaled), resolution - 1.0), 0.0)
+    return tl.mul(base.to(tl.int32).to(tl.uint32), step, sanitize_overflow=False), scaled - base
+
+
+@jit
+def cells(ux, uy, uz, resolutions, offsets, first, active, LEVELS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The cells of positions in ``LEVELS`` levels from ``first`` on: (BLOCK, LEVELS) row shares and fractions along x, y, z; and of the
+    levels (1, LEVELS): cells per axis, first row, mask of the hash, whether dense, used, and what a step along x, y, z multiplies."""
+    level = first + tl.arange(0, LEVELS)[None, :]
+    used = level < active
     resolution = tl.load(resolutions + level, mask=used, other=1)
     begin = tl.load(offsets + level, mask=used, other=0)
     rows = tl.load(offsets + level + 1, mask=used, other=1) - begin
@@ -28,21 +58,16 @@ def _level(resolutions, offsets, level, used):  # type: ignore[no-untyped-def]
     step_x = tl.where(dense, side * side, 1).to(tl.uint32)
     step_y = tl.where(dense, side, HASH_Y).to(tl.uint32)
     step_z = tl.where(dense, 1, HASH_Z).to(tl.uint32)
-    return resolution.to(tl.float32), begin, dense, (rows - 1).to(tl.uint32), step_x, step_y, step_z
+    cells_per_axis = resolution.to(tl.float32)
+    x, fx = _axis(ux, cells_per_axis, step_x)
+    y, fy = _axis(uy, cells_per_axis, step_y)
+    z, fz = _axis(uz, cells_per_axis, step_z)
+    return x, y, z, fx, fy, fz, cells_per_axis, begin.to(tl.int32), (rows - 1).to(tl.uint32), dense, used, step_x, step_y, step_z
 
 
 @jit
-def _axis(unit, resolution, step):  # type: ignore[no-untyped-def]
-    """Along one axis: the share of the cell's index in the row number, and where in the cell the position is."""
-    scaled = unit * resolution
-    # NaN > 0 is false: even then the cell is within the table
-    base = tl.where(scaled > 0.0, tl.minimum(tl.floor(scaled), resolution - 1.0), 0.0)
-    return tl.mul(base.to(tl.int32).to(tl.uint32), step, sanitize_overflow=False), scaled - base
-
-
-@jit
-def _row(x, y, z, step_x, step_y, step_z, dense, mask, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Row within the level of one of the eight corners, z fastest. Dense and hashed levels differ in + and ^ alone."""
+def _row(x, y, z, begin, mask, dense, step_x, step_y, step_z, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Table row of one of the eight corners, z fastest. Dense and hashed levels differ in + and ^ alone."""
     if CORNER & 4:
         x = tl.add(x, step_x, sanitize_overflow=False)
     if CORNER & 2:
@@ -50,7 +75,7 @@ def _row(x, y, z, step_x, step_y, step_z, dense, mask, CORNER: tl.constexpr):  #
     if CORNER & 1:
         z = tl.add(z, step_z, sanitize_overflow=False)
     total = tl.add(tl.add(x, y, sanitize_overflow=False), z, sanitize_overflow=False)
-    return tl.where(dense, total, (x ^ y ^ z) & mask).to(tl.int32)
+    return begin + tl.where(dense, total, (x ^ y ^ z) & mask).to(tl.int32)
 
 
 @jit
@@ -63,94 +88,101 @@ def _weight(x, y, z, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @jit
-def interpolate(ux, uy, uz, table, resolutions, offsets, level, used, live, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Features of one level at unit positions, (BLOCK, FEATURES); zeros where not ``live`` and for an unused level."""
-    resolution, begin, dense, mask, step_x, step_y, step_z = _level(resolutions, offsets, level, used)
-    x, fx = _axis(ux, resolution, step_x)
-    y, fy = _axis(uy, resolution, step_y)
-    z, fz = _axis(uz, resolution, step_z)
-    feature = tl.arange(0, FEATURES)[None, :]
-    rows = table + begin * FEATURES
-    here = (live & used)[:, None]
-    value = tl.zeros([ux.shape[0], FEATURES], tl.float32)
+def encode(ux, uy, uz, live, table, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Features at unit positions of the levels from ``first`` on, (BLOCK, COLUMNS); zeros where not ``live`` and for an unused level."""
+    LEVELS: tl.constexpr = COLUMNS // FEATURES
+    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(
+        ux, uy, uz, resolutions, offsets, first, active, LEVELS
+    )
+    feature = tl.arange(0, FEATURES)[None, None, :]
+    here = (live[:, None] & used)[:, :, None]
+    value = tl.zeros([ux.shape[0], LEVELS, FEATURES], tl.float32)
     for c in tl.static_range(8):
-        row = _row(x, y, z, step_x, step_y, step_z, dense, mask, c)
-        # the features of a row are one vector load
-        value += _weight(fx, fy, fz, c)[:, None] * tl.load(rows + row[:, None] * FEATURES + feature, mask=here, other=0.0)
-    return value
+        row = _row(x, y, z, begin, mask, dense, step_x, step_y, step_z, c)
+        read = tl.load(table + row[:, :, None] * FEATURES + feature, mask=here, other=0.0)
+        value += _weight(fx, fy, fz, c)[:, :, None] * read.to(tl.float32)
+    return tl.reshape(value, [ux.shape[0], COLUMNS])
 
 
 @jit
-def encode_kernel(  # type: ignore[no-untyped-def]
-    positions, table, resolutions, offsets, out, count, levels, active,
-    FEATURES: tl.constexpr, BLOCK: tl.constexpr, LEVELS: tl.constexpr,
-):  # fmt: skip
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def scatter(ux, uy, uz, g, live, out, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Add gradients (BLOCK, COLUMNS) of ``encode``'s features to the table's."""
+    LEVELS: tl.constexpr = COLUMNS // FEATURES
+    x, y, z, fx, fy, fz, _, begin, mask, dense, used, step_x, step_y, step_z = cells(
+        ux, uy, uz, resolutions, offsets, first, active, LEVELS
+    )
+    feature = tl.arange(0, FEATURES)[None, None, :]
+    g = tl.reshape(g, [ux.shape[0], LEVELS, FEATURES])
+    # NaN != 0, so that one is passed on
+    some = live[:, None] & used & (tl.sum((g != 0.0).to(tl.int32), 2) > 0)
+    for c in tl.static_range(8):
+        row = _row(x, y, z, begin, mask, dense, step_x, step_y, step_z, c)
+        part = _weight(fx, fy, fz, c)[:, :, None] * g
+        tl.atomic_add(out + row[:, :, None] * FEATURES + feature, part, mask=some[:, :, None], sem="relaxed")
+
+
+@jit
+def slope(ux, uy, uz, g, live, table, resolutions, offsets, first, active, FEATURES: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Gradient to unit positions from gradients (BLOCK, COLUMNS) of ``encode``'s features: x, y, z."""
+    LEVELS: tl.constexpr = COLUMNS // FEATURES
+    x, y, z, fx, fy, fz, scale, begin, mask, dense, used, step_x, step_y, step_z = cells(
+        ux, uy, uz, resolutions, offsets, first, active, LEVELS
+    )
+    feature = tl.arange(0, FEATURES)[None, None, :]
+    here = (live[:, None] & used)[:, :, None]
+    g = tl.reshape(g, [ux.shape[0], LEVELS, FEATURES])
+    gx = tl.zeros([ux.shape[0], LEVELS], tl.float32)
+    gy = tl.zeros([ux.shape[0], LEVELS], tl.float32)
+    gz = tl.zeros([ux.shape[0], LEVELS], tl.float32)
+    for c in tl.static_range(8):
+        row = _row(x, y, z, begin, mask, dense, step_x, step_y, step_z, c)
+        read = tl.load(table + row[:, :, None] * FEATURES + feature, mask=here, other=0.0)
+        value = tl.sum(g * read.to(tl.float32), 2) * scale
+        wx = fx if c & 4 else 1.0 - fx
+        wy = fy if c & 2 else 1.0 - fy
+        wz = fz if c & 1 else 1.0 - fz
+        gx += value * (wy * wz) * (1.0 if c & 4 else -1.0)
+        gy += value * (wx * wz) * (1.0 if c & 2 else -1.0)
+        gz += value * (wx * wy) * (1.0 if c & 1 else -1.0)
+    return tl.sum(gx, 1), tl.sum(gy, 1), tl.sum(gz, 1)
+
+
+@jit
+def encode_kernel(positions, table, resolutions, offsets, out, count, width, active, FEATURES: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < count
     x, y, z = position(positions, i, live)
-    feature = tl.arange(0, FEATURES)[None, :]
-    for k in tl.static_range(LEVELS):
-        level = tl.program_id(1) * LEVELS + k
-        value = interpolate(x, y, z, table, resolutions, offsets, level, level < active, live, FEATURES)
-        tl.store(out + (i * levels + level)[:, None] * FEATURES + feature, value, mask=(live & (level < levels))[:, None])
+    first = tl.program_id(1) * (COLUMNS // FEATURES)
+    column = first * FEATURES + tl.arange(0, COLUMNS)
+    value = encode(x, y, z, live, table, resolutions, offsets, first, active, FEATURES)
+    tl.store(out + i.to(tl.int64)[:, None] * width + column[None, :], value, mask=live[:, None] & (column < width)[None, :])
 
 
 @jit
 def encode_backward_kernel(  # type: ignore[no-untyped-def]
-    positions, gradient, stride, resolutions, offsets, out, count, active,
-    FEATURES: tl.constexpr, BLOCK: tl.constexpr, LEVELS: tl.constexpr,
+    positions, table, gradient, stride, resolutions, offsets, table_out, positions_out, count, active,
+    FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    """To the table, to the positions, either may be None."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < count
-    ux, uy, uz = position(positions, i, live)
-    feature = tl.arange(0, FEATURES)[None, :]
-    for k in tl.static_range(LEVELS):
-        level = tl.program_id(1) * LEVELS + k
-        used = level < active
-        resolution, begin, dense, mask, step_x, step_y, step_z = _level(resolutions, offsets, level, used)
-        x, fx = _axis(ux, resolution, step_x)
-        y, fy = _axis(uy, resolution, step_y)
-        z, fz = _axis(uz, resolution, step_z)
-        g = tl.load(gradient + (i * stride + level * FEATURES)[:, None] + feature, mask=(live & used)[:, None], other=0.0)
-        # most samples of a ray lie in empty space and have no gradient; NaN != 0, so that one is passed on
-        some = (tl.sum((g != 0.0).to(tl.int32), 1) > 0)[:, None]
-        rows = out + begin * FEATURES
-        for c in tl.static_range(8):
-            row = _row(x, y, z, step_x, step_y, step_z, dense, mask, c)
-            tl.atomic_add(rows + row[:, None] * FEATURES + feature, _weight(fx, fy, fz, c)[:, None] * g, mask=some, sem="relaxed")
-
-
-@jit
-def encode_positions_backward_kernel(  # type: ignore[no-untyped-def]
-    positions, table, gradient, stride, resolutions, offsets, out, count, active, FEATURES: tl.constexpr, BLOCK: tl.constexpr
-):
-    """A program does all levels, so that a position's gradient is one sum and needs no atomics."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = i < count
-    ux, uy, uz = position(positions, i, live)
-    feature = tl.arange(0, FEATURES)[None, :]
+    x, y, z = position(positions, i, live)
     gx = tl.zeros([BLOCK], tl.float32)
     gy = tl.zeros([BLOCK], tl.float32)
     gz = tl.zeros([BLOCK], tl.float32)
-    for level in range(0, active):
-        resolution, begin, dense, mask, step_x, step_y, step_z = _level(resolutions, offsets, level, level < active)
-        x, fx = _axis(ux, resolution, step_x)
-        y, fy = _axis(uy, resolution, step_y)
-        z, fz = _axis(uz, resolution, step_z)
-        g = tl.load(gradient + (i * stride + level * FEATURES)[:, None] + feature, mask=live[:, None], other=0.0)
-        rows = table + begin * FEATURES
-        for c in tl.static_range(8):
-            row = _row(x, y, z, step_x, step_y, step_z, dense, mask, c)
-            value = tl.sum(g * tl.load(rows + row[:, None] * FEATURES + feature, mask=live[:, None], other=0.0), 1) * resolution
-            wx = fx if c & 4 else 1.0 - fx
-            wy = fy if c & 2 else 1.0 - fy
-            wz = fz if c & 1 else 1.0 - fz
-            gx += value * (wy * wz) * (1.0 if c & 4 else -1.0)
-            gy += value * (wx * wz) * (1.0 if c & 2 else -1.0)
-            gz += value * (wx * wy) * (1.0 if c & 1 else -1.0)
-    tl.store(out + 3 * i, gx, mask=live)
-    tl.store(out + 3 * i + 1, gy, mask=live)
-    tl.store(out + 3 * i + 2, gz, mask=live)
+    for first in range(0, active, COLUMNS // FEATURES):
+        column = first * FEATURES + tl.arange(0, COLUMNS)
+        here = live[:, None] & (column < active * FEATURES)[None, :]
+        g = tl.load(gradient + i.to(tl.int64)[:, None] * stride + column[None, :], mask=here, other=0.0)
+        if table_out is not None:
+            scatter(x, y, z, g, live, table_out, resolutions, offsets, first, active, FEATURES)
+        if positions_out is not None:
+            sx, sy, sz = slope(x, y, z, g, live, table, resolutions, offsets, first, active, FEATURES)
+            gx, gy, gz = gx + sx, gy + sy, gz + sz
+    if positions_out is not None:
+        tl.store(positions_out + 3 * i, gx, mask=live)
+        tl.store(positions_out + 3 * i + 1, gy, mask=live)
+        tl.store(positions_out + 3 * i + 2, gz, mask=live)
 
 
 class _HashEncode(torch.autograd.Function):
@@ -163,36 +195,29 @@ class _HashEncode(torch.autograd.Function):
         ctx.save_for_backward(positions, table if ctx.needs_input_grad[0] else None, resolutions, offsets)
         out = torch.empty(count, levels * features, device=table.device)
         if out.numel():
-            grid = (triton.cdiv(count, BLOCK), triton.cdiv(levels, _LEVELS))
+            grid = (triton.cdiv(count, BLOCK), triton.cdiv(levels * features, COLUMNS.value))
             with torch.cuda.device_of(table):
-                encode_kernel[grid](positions, table, resolutions, offsets, out, count, levels, ctx.active, features, BLOCK, _LEVELS)
+                encode_kernel[grid](positions, table, resolutions, offsets, out, count, levels * features, ctx.active, features, BLOCK)
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):  # type: ignore[no-untyped-def]
         positions, table, resolutions, offsets = ctx.saved_tensors
-        count, active, features = positions.shape[0], ctx.active, ctx.features
-        to_positions = to_table = None
+        count = positions.shape[0]
         if gradient.stride(1) != 1:  # a slice of wider rows is read as it is
             gradient = gradient.contiguous()
-        blocks = triton.cdiv(count, BLOCK)
-        with torch.cuda.device_of(positions):
-            if ctx.needs_input_grad[0]:
-                to_positions = torch.empty_like(positions)
-                if count:
-                    encode_positions_backward_kernel[(blocks,)](
-                        positions, table, gradient, gradient.stride(0), resolutions, offsets, to_positions, count, active, features, BLOCK
-                    )
-            if ctx.needs_input_grad[1]:
-                to_table = torch.zeros(ctx.rows, features, device=positions.device)
-                if count and active:
-                    encode_backward_kernel[(blocks, triton.cdiv(active, _LEVELS))](
-                        positions, gradient, gradient.stride(0), resolutions, offsets, to_table, count, active, features, BLOCK, _LEVELS
-                    )
+        to_positions = torch.empty_like(positions) if ctx.needs_input_grad[0] else None
+        to_table = torch.zeros(ctx.rows, ctx.features, device=positions.device) if ctx.needs_input_grad[1] else None
+        if count:
+            with torch.cuda.device_of(positions):
+                encode_backward_kernel[(triton.cdiv(count, BLOCK),)](
+                    positions, table, gradient, gradient.stride(0), resolutions, offsets, to_table, to_positions, count, ctx.active,
+                    ctx.features, BLOCK,
+                )  # fmt: skip
         return to_positions, to_table, None, None, None
 
 
 def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: Tensor, active: int) -> Tensor:
-    """See ``reference.hash_encode``; float32, F a power of two, once differentiable in ``table`` and in ``positions``."""
+    """See ``reference.hash_encode``; float32, F a power of two up to 16, once differentiable in ``table`` and in ``positions``."""
     return _HashEncode.apply(positions.contiguous(), table.contiguous(), resolutions, offsets, active)

@@ -1,4 +1,4 @@
-"""What the Triton kernels share: the compiler, constants, and whether they can run on this machine."""
+"""What the Triton kernels share: the compiler, constants, small device functions, and whether they can run on this machine."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mmsynth.field.kernels import constants
 
@@ -15,10 +16,18 @@ try:
 except ImportError:
     triton = tl = None
 
+_TESTED = (3, 9)  # of triton, not included: from here on its interpreter refuses the kernels, and nobody has run them
+_PROGRAMS_PER_CORE = 4  # of a persistent kernel, for each multiprocessor
+# numbers that a kernel must not be compiled anew for where they happen to be 1 or multiples of 16
+_PLAIN = [
+    "count", "rays", "rows", "levels", "active", "grid", "width", "stride", "size", "bright", "bisections", "lamps", "asked", "drawn", "modalities", "first",
+    "second", "third", "fourth", "tile_bisections", "frame_bisections",
+]  # fmt: skip
+
 
 def jit(function: Any) -> Any:
     """``triton.jit`` that compiles once, not anew for sizes that happen to be 1 or multiples of 16; a no-op without triton."""
-    return function if triton is None else triton.jit(do_not_specialize=["count", "rays", "levels", "active", "k", "grid"])(function)
+    return function if triton is None else triton.jit(do_not_specialize=_PLAIN)(function)
 
 
 def constant(value: float) -> Any:
@@ -29,8 +38,24 @@ def constant(value: float) -> Any:
 SOLID, OUTSIDE = constant(constants.SOLID), constant(constants.OUTSIDE)
 ALONG_FACE, NO_CROSSING = constant(constants.ALONG_FACE), constant(constants.NO_CROSSING)
 FACE_OVERSHOOT = constant(constants.FACE_OVERSHOOT)
+LEAST_ADVANCE, LONGEST_STEP = constant(constants.LEAST_ADVANCE), constant(constants.LONGEST_STEP)
+SOFT_SURFACE, LAYER_GAP = constant(constants.SOFT_SURFACE), constant(constants.LAYER_GAP)
+MAX_SAMPLES = constant(constants.MAX_SAMPLES_PER_RAY)
+LEAST_WEIGHT = constant(constants.LEAST_WEIGHT)
 FIRST_FEATURE_ROW = constant(constants.FIRST_FEATURE_ROW)
 HASH_Y, HASH_Z = constant(constants.HASH_PRIMES[1]), constant(constants.HASH_PRIMES[2])
+HUBER = constant(constants.HUBER_DELTA)
+COLUMNS = constant(16)  # features that are looked up together, the least depth of a matrix product on tensor cores
+
+
+def programs(device: torch.device) -> int:
+    """Programs of a persistent kernel: sums of as many parts are added in order, so a result depends on the kind of GPU alone."""
+    return 2 if device.type == "cpu" else _PROGRAMS_PER_CORE * torch.cuda.get_device_properties(device).multi_processor_count
+
+
+def scalar(value: float | Tensor, device: torch.device) -> Tensor:
+    """A number that kernels read from memory, float64 (): one that changes in a captured graph is a tensor already."""
+    return value if isinstance(value, Tensor) else torch.full((), value, dtype=torch.float64, device=device)
 
 
 @jit
@@ -39,6 +64,60 @@ def position(positions, i, live):  # type: ignore[no-untyped-def]
     y = tl.load(positions + 3 * i + 1, mask=live, other=0.0)
     z = tl.load(positions + 3 * i + 2, mask=live, other=0.0)
     return x, y, z
+
+
+@jit
+def softplus(x):  # type: ignore[no-untyped-def]
+    """log(1 + eˣ) and its slope. Triton has no log1p: below 1e-2 its series, exact to 2e-9 of the result."""
+    e = tl.exp(-tl.abs(x))
+    log1p = tl.where(e < 1e-2, e * (1.0 - e * (0.5 - e * (1.0 / 3.0 - e * 0.25))), tl.log(1.0 + e))
+    return tl.where(x > 0.0, x, 0.0 * x) + log1p, tl.where(x > 0.0, 1.0, e) / (1.0 + e)
+
+
+@jit
+def sigmoid(x):  # type: ignore[no-untyped-def]
+    e = tl.exp(-tl.abs(x))
+    return tl.where(x >= 0.0, 1.0, e) / (1.0 + e)
+
+
+@jit
+def first_number(ray, of, count, bisections):  # type: ignore[no-untyped-def]
+    """The first number of each ray or of those after it, by bisection: ``ray`` (count,) never decreases."""
+    low = of * 0
+    high = low + count
+    for _ in range(0, bisections):
+        middle = (low + high) // 2
+        before = (low < high) & (tl.load(ray + middle, mask=low < high, other=0).to(tl.int32) < of)
+        low, high = tl.where(before, middle + 1, low), tl.where(before, high, middle)
+    return low
+
+
+@jit
+def sum_of_pair(values, PAIRS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """(2 PAIRS,) → the sum of neighbours, at both of them."""
+    both = tl.sum(tl.reshape(values, (PAIRS, 2)), 1)
+    return tl.reshape(tl.broadcast_to(both[:, None], (PAIRS, 2)), (2 * PAIRS,))
+
+
+@jit
+def contracted(x, y, z, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """A position in the frame of the grid, and its distance from the centre before contraction, at least 1."""
+    reach = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
+    if CONTRACTED:
+        factor = (2.0 - 1.0 / reach) / reach
+        x, y, z = x * factor, y * factor, z * factor
+    return x, y, z, reach
+
+
+@jit
+def back_to_world(x, y, z, gx, gy, gz, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Gradient to a position from the gradient to its contraction."""
+    if CONTRACTED:
+        r = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
+        factor = (2.0 - 1.0 / r) / r  # 1 where r is, and the change of it 0
+        change = (2.0 - 2.0 * r) / (r * r * r * r) * (x * gx + y * gy + z * gz)
+        gx, gy, gz = factor * gx + change * x, factor * gy + change * y, factor * gz + change * z
+    return gx, gy, gz
 
 
 @jit
@@ -61,6 +140,8 @@ def available() -> tuple[bool, str]:
     """Whether the operations can run on this machine's GPU; if not, why: one line."""
     if triton is None:
         return False, "triton is not installed"
+    if tuple(map(int, triton.__version__.split(".")[:2])) >= _TESTED:
+        return False, f"triton {triton.__version__} is not supported, install triton 3.6.0"
     if not torch.cuda.is_available():
         return False, "torch sees no CUDA device"
     return _probe()

@@ -1,0 +1,243 @@
+"""Drawing photosites on the CPU: a ray is one pass from its random numbers to all that was measured along it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from mmsynth.field.kernels.constants import DRAW_JITTER, DRAW_PIXEL, DRAW_TILE, PURPOSE_STRIDE, WORD
+from mmsynth.field.kernels.parameters import Cameras, Drawn, Frames, Measured, Modalities, Selection
+
+P = TypeVar("P", bound=tuple[Any, ...])
+CHUNK = 64  # rays
+_u, _f = np.uint32, np.float32
+_ZERO, _ONE, _TWO, _THREE, _SIX = _f(0.0), _f(1.0), _f(2.0), _f(3.0), _f(6.0)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _scramble(x):  # type: ignore[no-untyped-def]
+    """See ``drawing.scramble``."""
+    x = _u(_u(x ^ _u(x >> _u(16))) * _u(0x7FEB352D))
+    x = _u(_u(x ^ _u(x >> _u(15))) * _u(0x846CA68B))
+    return _u(x ^ _u(x >> _u(16)))
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _bits(key, number, purpose):  # type: ignore[no-untyped-def]
+    """See ``drawing.random_bits``; as int64."""
+    mixed = _scramble(_u(np.int64(number) + np.int64(key[0])))
+    return np.int64(_scramble(_u(mixed ^ _u(np.int64(key[1]) + purpose * PURPOSE_STRIDE))))
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _first_above(ascending, begin, end, value):  # type: ignore[no-untyped-def]
+    """The first of a range whose number is larger than ``value``."""
+    length = end - begin
+    while length > 1:  # without a branch that nobody could predict
+        half = length // 2
+        begin += half if ascending[begin + half - 1] <= value else 0
+        length -= half
+    return begin + (1 if length > 0 and ascending[begin] <= value else 0)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _set_bit(words, first, kth):  # type: ignore[no-untyped-def]
+    """Where the kth bit is that is set, counted from the lowest of word ``first``."""
+    at = 0
+    while True:
+        word = _u(words[first])
+        # Hamming weights of pairs, fours, and all
+        pairs = _u(word - _u(_u(word >> _u(1)) & _u(0x55555555)))
+        fours = _u(_u(pairs & _u(0x33333333)) + _u(_u(pairs >> _u(2)) & _u(0x33333333)))
+        held = np.int64(_u(_u(_u(fours + _u(fours >> _u(4))) & _u(0x0F0F0F0F)) * _u(0x01010101)) >> _u(24))
+        if kth < held:
+            break
+        kth -= held
+        first += 1
+        at += WORD
+    while True:
+        if word & _u(1):
+            if kth == 0:
+                return at
+            kth -= 1
+        word = _u(word >> _u(1))
+        at += 1
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _decoded(frames, kind, at):  # type: ignore[no-untyped-def]
+    if kind == 0:
+        return _f(frames.codes8[at]) / _f(255.0)
+    if kind == 1:
+        return _f(frames.codes16[at]) / _f(65535.0)
+    return frames.floats[at]
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _cubic(t):  # type: ignore[no-untyped-def]
+    """Weights of four nodes at 0, 1, 2, 3."""
+    a, b, c = t - _ONE, t - _TWO, t - _THREE
+    return -a * b * c / _SIX, t * b * c / _TWO, -t * a * c / _TWO, t * a * b / _SIX
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def _in_camera(cameras, camera, row, column):  # type: ignore[no-untyped-def]
+    """The direction of a pixel in the camera's axes."""
+    step, across, first, nodes = np.int64(cameras.step[camera]), np.int64(cameras.across[camera]), cameras.first[camera], cameras.nodes
+    if step == 1:
+        node = first + row * across + column
+        return nodes[node, 0], nodes[node, 1], nodes[node, 2]
+    left = min(max(column // step - 1, 0), across - 4)
+    top = min(max(row // step - 1, 0), np.int64(cameras.down[camera]) - 4)
+    columns = _cubic(_f(column) / _f(step) - _f(left))
+    rows = _cubic(_f(row) / _f(step) - _f(top))
+    x, y, z = _ZERO, _ZERO, _ZERO
+    for j in range(4):
+        node = first + (top + j) * across + left
+        for i in range(4):
+            share = rows[j] * columns[i]
+            x += share * nodes[node + i, 0]
+            y += share * nodes[node + i, 1]
+            z += share * nodes[node + i, 2]
+    length = _f(math.sqrt(x * x + y * y + z * z))
+    return x / length, y / length, z / length
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def draw_rays(frames, cameras, modalities, selection, rays, key, drawn, measured):  # type: ignore[no-untyped-def]
+    """Fills ``drawn``, the first seven of ``Drawn``, and ``measured``; rays: (N,) int64, key: (2,) int64."""
+    n_modalities, n_drawn = rays.shape[0], np.count_nonzero(rays)
+    rays_end, numbers_end = np.cumsum(rays), np.cumsum(rays * modalities.values)
+    axes_begin = measured.target.shape[0] - measured.axes.shape[0]
+    out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame = drawn
+    target, of_ray, output, axes, level, saturation, weight = measured
+    count = out_jitter.shape[0]
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        for ray in range(np.int64(chunk) * CHUNK, min(count, (np.int64(chunk) + 1) * CHUNK)):
+            n = _first_above(rays_end, 0, n_modalities - 1, ray)
+            tile = _first_above(
+                selection.ends, np.int64(modalities.first_tile[n]), np.int64(modalities.first_tile[n + 1]) - 1, _bits(key, ray, DRAW_TILE)
+            )
+            frame = _first_above(frames.first_tile, np.int64(modalities.first_frame[n]), np.int64(modalities.first_frame[n + 1]), tile) - 1
+            camera = frames.camera[frame]
+            width, tile_width = np.int64(cameras.width[camera]), np.int64(modalities.tile_width[n])
+            tile_height = np.int64(modalities.tile_height[n])
+            tiles_across, local = (width + tile_width - 1) // tile_width, tile - frames.first_tile[frame]
+            down, across = local // tiles_across, local % tiles_across
+            kth = (_bits(key, ray, DRAW_PIXEL) * np.int64(selection.pixels[tile])) >> 32
+            columns, first_word = min(tile_width, width - across * tile_width), selection.first_word[n]
+            if first_word >= 0:
+                per_tile = (tile_width * tile_height) // WORD
+                kth = _set_bit(selection.words, first_word + (tile - np.int64(modalities.first_tile[n])) * per_tile, kth)
+                columns = tile_width
+            row, column = down * tile_height + kth // columns, across * tile_width + kth % columns
+
+            x, y, z = _in_camera(cameras, camera, row, column)
+            turn, from_ = frames.rotation[frame], frames.origin[frame]
+            dx = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+            dy = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
+            dz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+            out_directions[ray, 0], out_directions[ray, 1], out_directions[ray, 2] = dx, dy, dz
+            out_origins[ray, 0], out_origins[ray, 1], out_origins[ray, 2] = from_[0], from_[1], from_[2]
+            out_jitter[ray] = _f(_bits(key, ray, DRAW_JITTER) >> 8) * _f(2.0**-24)
+            out_tile[ray] = tile
+            out_weight[ray] = selection.weight[tile]
+
+            values, kind, stride = np.int64(modalities.values[n]), frames.kind[frame], np.int64(frames.stride[frame])
+            at, alpha = frames.start[frame] + (row * width + column) * stride, _ONE
+            if stride > values:
+                alpha = _decoded(frames, kind, at + values)
+                out_alpha[ray] = alpha
+            else:
+                out_alpha[ray] = modalities.opaque[n]
+            mosaic, analyser = np.int64(modalities.pattern_first[n]), np.int64(modalities.analyser_first[n])
+            rays_begin, numbers_begin = rays_end[n] - rays[n], numbers_end[n] - rays[n] * values
+            share = out_weight[ray] / _f(n_drawn * rays[n] * values)
+            if analyser >= 0:
+                along = turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz
+                rx, ry, rz = turn[0, 0] - along * dx, turn[1, 0] - along * dy, turn[2, 0] - along * dz
+                length = _f(math.sqrt(rx * rx + ry * ry + rz * rz))
+                rx, ry, rz = rx / length, ry / length, rz / length
+                ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
+            for j in range(values):
+                number = numbers_begin + (ray - rays_begin) * values + j
+                channel = np.int64(j)
+                if mosaic >= 0:
+                    pattern_width = np.int64(modalities.pattern_width[n])
+                    place = (row % np.int64(modalities.pattern_height[n])) * pattern_width + column % pattern_width
+                    channel = np.int64(modalities.pattern[mosaic + place])
+                target[number] = _decoded(frames, kind, at + j) * alpha
+                of_ray[number] = ray
+                out_frame[number] = frame
+                level[number] = modalities.level[n]
+                saturation[number] = modalities.saturation[n]
+                weight[number] = share
+                output[number] = modalities.output[n]
+                if analyser >= 0:
+                    e, cos, sin = (
+                        number - axes_begin,
+                        modalities.analysers[analyser + channel, 0],
+                        modalities.analysers[analyser + channel, 1],
+                    )
+                    axes[e, 0], axes[e, 1], axes[e, 2] = cos * rx + sin * ux, cos * ry + sin * uy, cos * rz + sin * uz
+                else:
+                    output[number] += channel
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignore[no-untyped-def]
+    """See ``drawing.odds``; ``evenly``: float64."""
+    for n in prange(first_tile.shape[0] - 1):
+        begin, end = first_tile[n], first_tile[n + 1]
+        pixels, total = 0, 0.0
+        for tile in range(begin, end):
+            pixels += count[tile]
+            total += np.float64(residual[tile]) * count[tile]
+        if total > 0.0:
+            base, slope = evenly, (1.0 - evenly) * pixels / total
+        else:
+            base, slope = 1.0, 0.0
+        whole, upto, before, last = 0.0, 0.0, np.int64(0), begin
+        for tile in range(begin, end):
+            whole += (base + slope * residual[tile]) * count[tile]
+            if count[tile] > 0:
+                last = tile
+        for tile in range(begin, end):
+            upto += (base + slope * residual[tile]) * count[tile]
+            here = np.int64(upto / whole * 4294967296.0) if tile < last else np.int64(1) << 32
+            ends[tile] = here
+            weight[tile] = _f(count[tile] * 4294967296.0 / (np.float64(here - before) * pixels)) if here > before else _ZERO
+            before = here
+
+
+def _arrays(table: P) -> P:
+    return type(table)(*(x.numpy() for x in table))
+
+
+def draw(
+    frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
+) -> Drawn:
+    """See ``drawing.draw``; float32."""
+    values = modalities.values.tolist()
+    count, numbers = sum(rays), sum(r * k for r, k in zip(rays, values, strict=True))
+    polarized = sum(r * k for r, k, a in zip(rays, values, modalities.analyser_first.tolist(), strict=True) if a >= 0)
+    single, whole = torch.empty, lambda length: torch.empty(length, dtype=torch.int64)
+    drawn = single(count, 3), single(count, 3), single(count), single(count), single(count), whole(count), whole(numbers)
+    measured = Measured(
+        single(numbers), whole(numbers), whole(numbers), single(polarized, 3), single(numbers), single(numbers), single(numbers)
+    )
+    tables = _arrays(frames), _arrays(cameras), _arrays(modalities), _arrays(selection)
+    draw_rays(*tables, np.array(rays), np.array(key), tuple(x.numpy() for x in drawn), _arrays(measured))
+    return Drawn(*drawn, measured)
+
+
+def odds(residual: torch.Tensor, count: torch.Tensor, first_tile: torch.Tensor, evenly: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """See ``drawing.odds``; float32."""
+    ends, weight = torch.empty_like(residual, dtype=torch.int64), torch.empty_like(residual)
+    fill_odds(residual.numpy(), count.numpy(), first_tile.numpy(), float(evenly), ends.numpy(), weight.numpy())
+    return ends, weight

@@ -1,0 +1,242 @@
+"""A step of a fit on the CPU, fused: each chunk of rays passes from its samples to all gradients of its loss in one go, in the caches.
+
+Chunks are tasks that threads take from a counter, so that none waits for another that the machine has slowed; what they leave is per chunk,
+and summed in the order of the chunks. The tables follow when all chunks are done: a task for each level (``learn_tables``).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
+from mmsynth.field.kernels.cpu import shading
+from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, padded_output, scatter_block
+from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
+from mmsynth.field.kernels.cpu.matrices import padded, padded_to
+from mmsynth.field.kernels.cpu.mirrors import LightLayers, mirrors_backward, mix, mix_backward, see_mirrors
+from mmsynth.field.kernels.cpu.shading import Layers, clear_gradients, compare_rays, first_at
+from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
+from mmsynth.field.kernels.cpu.tasks import take
+from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
+from mmsynth.field.kernels.parameters import Rays, ShadedRays
+
+_f = np.float32
+_ZERO, _ONE = _f(0.0), _f(1.0)
+
+
+class TableStore(NamedTuple):
+    """What tables learn from, a slot per chunk of rays: rows (see ``blocks``) of the samples that have a gradient, and of the sections; how
+    many; the gradients of the surface's weights."""
+
+    block: np.ndarray
+    samples: np.ndarray
+    s_block: np.ndarray
+    sections: np.ndarray
+    turned_out: np.ndarray
+    output_out: np.ndarray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _learn_rays(  # type: ignore[no-untyped-def]
+    chunk, slot, begin, count, total, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light,
+    view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
+    g_gain,
+):  # fmt: skip
+    """All of a chunk of rays, of which ``begin`` is the first: its loss."""
+    s, sharpness = scratch, sampling.sharpness
+    end = begin + count
+    here = Rays(rays.origins[begin:end], rays.directions[begin:end], rays.near[begin:end], rays.far[begin:end], rays.jitter[begin:end])
+    features, weight, distance, shown, depth = s.features[slot], s.weight[slot], s.distance[slot], s.shown[slot], s.depth[slot]
+    behind, g_features, g_share = s.behind[slot], s.g_features[slot], s.g_share[slot]
+    wide = grid.extent > _ONE
+    samples[chunk] = march_rays(0, count, slot, here, states, sampling, grid, surface, store)
+    sections = find_sections(0, count, slot, here, wide, sampling, store, weight, depth)
+    composite(0, count, slot, sections, appearance, store, features, distance, shown)
+    share, rows = weight.reshape(2 * CHUNK), features.reshape(2 * CHUNK, -1)
+    opacity = np.empty(CHUNK, np.float32)
+    loss = 0.0
+    for i in range(count):
+        behind[i] = CHUNK + i if weight[1, i] != _ZERO else -1
+        opacity[i] = weight[0, i] + weight[1, i]
+    taps.used[chunk, 0] = 0
+    taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
+    shines, trains = len(lamps.position) > 0, view.trains_geometry[begin:end]
+    factor = eikonal.weight / _f(max(asked, 1))
+    if shines:
+        out.first[chunk], out.first_bias[chunk], out.second[chunk], out.second_bias[chunk] = _ZERO, _ZERO, _ZERO, _ZERO
+        out.position[chunk], out.spectrum[chunk] = _ZERO, _ZERO
+    out.far[chunk] = _ZERO
+    clear_gradients(shaded, chunk)
+    to_shade, to_share = rows, share
+    if len(far_light):
+        mix(count, far_light, rows, share, opacity, behind, s.mixed[slot], s.mixed_share[slot])
+        to_shade, to_share = s.mixed[slot], s.mixed_share[slot]
+    seen = ShadedRays(to_shade, to_share, behind, here.directions, view.degrees[begin:end], trains)
+    for sub in range(0, count, shading.CHUNK):
+        some = np.int64(min(shading.CHUNK, count - sub))
+        first, n = np.int64(taps.used[chunk, 0]), np.int64(0)
+        if shines:
+            n = see_mirrors(
+                sub, some, begin, here, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal.mirror_epsilon,
+                mirrored,
+            )  # fmt: skip
+        for i in range(sub, sub + some):
+            for which in range(2):
+                g_share[which * CHUNK + i] = _ZERO
+                g_features[which * CHUNK + i] = _ZERO
+        if first_at(measured.ray, begin + sub) < first_at(measured.ray, begin + sub + some):
+            loss += compare_rays(
+                np.int64(sub), some, begin, slot, chunk, seen, measured, gain, mirrored, layers, heads, heads_bias, True, shaded, squared,
+                g_features, g_share, g_gain, g_mirrored,
+            )  # fmt: skip
+        if len(far_light):
+            mix_backward(
+                some, far_light, rows[sub:], share[sub:], opacity[sub:], _shifted(behind, sub, some), s.mixed_share[slot][sub:],
+                g_features[sub:], g_share[sub:], out.far[chunk],
+            )  # fmt: skip
+        if shines:
+            loss += mirrors_backward(
+                sub, some, n, first, begin, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor,
+                g_mirrored, out,
+            )  # fmt: skip
+    if not shines:
+        loss += learn_met(begin, count, total, here, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps)
+    if len(opacities.target):
+        for i in range(count):
+            off = opacity[i] - opacities.target[begin + i]
+            w, along = opacities.weight[begin + i], opacities.linear[begin + i]
+            loss += np.float64(w * off * off + along * opacity[i])
+            for which in range(2):
+                g_share[which * CHUNK + i] += _f(2.0) * w * off + along
+    rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
+    kept.turned_out[chunk], kept.output_out[chunk] = _ZERO, _ZERO
+    n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
+    samples_backward(
+        kept.block[chunk], store.hidden[slot], store.sdf[slot], n, grid.active, surface, kept.turned_out[chunk], kept.output_out[chunk]
+    )
+    return loss
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-def]
+    """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Hidden units and
+    gradients of these samples move to the front of their arrays."""
+    sdf, block, hidden, out = store.sdf[slot], store.block[slot], store.hidden[slot], kept.block[chunk]
+    n = np.int64(0)
+    for i in range(store.samples[slot, 0]):
+        if sdf[i] == _ZERO:
+            continue
+        for j in range(width):
+            out[n, j] = block[i, j]
+        if n < i:
+            hidden[n] = hidden[i]
+            sdf[n] = sdf[i]
+        n += 1
+    kept.samples[chunk, 0] = n
+    sections = store.s_count[slot, 0]
+    kept.sections[chunk, 0] = sections
+    for i in range(sections):
+        for j in range(s_width):
+            kept.s_block[chunk, i, j] = store.s_block[slot, i, j]
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shifted(behind, sub, some):  # type: ignore[no-untyped-def]
+    """Rows from the ``sub``-th on."""
+    out = np.empty(some, np.int64)
+    for i in range(some):
+        out[i] = behind[sub + i] - sub if behind[sub + i] >= 0 else -1
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _work(  # type: ignore[no-untyped-def]
+    worker, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
+    measured,
+    gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+):  # fmt: skip
+    """Take chunks of rays, and then points, until there are none."""
+    total, points = rays.origins.shape[0], eikonal.points.shape[0]
+    chunks = (total + CHUNK - 1) // CHUNK
+    asked = points + (total if len(lamps.position) else len(eikonal.noise))
+    while True:
+        chunk = take(next_task, 0)
+        if chunk < chunks:
+            begin = chunk * CHUNK
+            out.loss[chunk] = _learn_rays(
+                chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, surface, appearance, layers,
+                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded,
+                scratch, out,
+                samples, squared, mirrored, g_mirrored, g_gain,
+            )  # fmt: skip
+            continue
+        begin = (chunk - chunks) * POINTS
+        if begin >= points:
+            return
+        factor = eikonal.weight / _f(max(asked, 1))
+        out.loss[chunk] = learn_points(
+            chunk, np.int64(min(POINTS, points - begin)), eikonal.points, begin, eikonal, factor, grid, surface, scratch, worker, taps
+        )
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def learn_rays(  # type: ignore[no-untyped-def]
+    threads, next_task, rays, states, sampling, grid, network, appearance, shader, light, lamps, far_light, view, measured, gain,
+    opacities, eikonal,
+    store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+):  # fmt: skip
+    """See ``learning.learn``: all but the gradients of the tables, which ``learn_tables`` adds up.
+
+    light: its network with the columns of the lamps that there are. lamps: those. gain, mirrored: (M,), empty where there are none.
+    """
+    layers = Layers(
+        padded(shader.first), padded(shader.first.T), shader.first_bias,
+        padded(shader.second), padded(shader.second.T), shader.second_bias,
+    )  # fmt: skip
+    inputs, units = store.block.shape[2], store.hidden.shape[2]
+    surface = SurfaceLayers(
+        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
+        network.inner_radius, network.outer_radius,
+    )  # fmt: skip
+    network_of_light = LightLayers(
+        padded(light.first), padded(light.first.T), light.first_bias,
+        padded(light.second), padded(light.second.T), light.second_bias,
+    )  # fmt: skip
+    next_task[0] = 0
+    for worker in prange(threads):
+        _work(
+            np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, shader.heads, shader.heads_bias,
+            network_of_light, lamps, far_light, view, measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out,
+            samples, squared,
+            mirrored, g_mirrored, g_gain,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+    """Take levels, of the surface's table and then of the appearance's, until there are none."""
+    while True:
+        task = take(next_task, 0)
+        level = task - grid.active
+        if level >= appearance.active:
+            return
+        for chunk in range(chunks):
+            if level < 0:
+                scatter_block(kept.block[chunk], kept.samples[chunk, 0], grid, gradient, task)
+            else:
+                scatter_block(kept.s_block[chunk], kept.sections[chunk, 0], appearance, a_gradient, level)
+        for chunk in range(chunks + point_chunks if level < 0 else 0):
+            scatter_block(taps.block[chunk], taps.used[chunk, 0], grid, gradient, task)
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def learn_tables(threads, next_task, rays, points, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
+    """Add what ``learn_rays`` found to the gradients of both tables, a task for each level."""
+    chunks, point_chunks = (rays + CHUNK - 1) // CHUNK, (points + POINTS - 1) // POINTS
+    next_task[0] = 0
+    for _ in prange(threads):
+        _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient)

@@ -1,0 +1,129 @@
+"""Products of small matrices on the CPU, in tiles that stay in registers.
+
+Matrices are padded to whole tiles: rows to a multiple of ``TILE_ROWS``, columns to one of ``TILE_COLS``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+TILE_ROWS, TILE_COLS = 4, 16
+_VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
+_BYTE, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
+
+
+def splat(builder, value, vector):  # type: ignore[no-untyped-def]
+    """A vector of this type, full of one number."""
+    undefined = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_I32, vector.count), [0] * vector.count))
+
+
+def element(context, builder, kind, array, i, j):  # type: ignore[no-untyped-def]
+    """Address of an element of a matrix, in bytes, and the matrix's strides."""
+    matrix = context.make_array(kind)(context, builder, array)
+    strides = cgutils.unpack_tuple(builder, matrix.strides, 2)
+    data = builder.bitcast(matrix.data, _BYTE.as_pointer())
+    return builder.gep(data, [builder.add(builder.mul(i, strides[0]), builder.mul(j, strides[1]))]), *strides
+
+
+def _tile(height: int, vectors: int) -> Any:
+    """An intrinsic of tiles of so many rows and vectors of columns."""
+
+    @intrinsic
+    def add_tile(typingctx, a, b, out, row, inner, column):  # type: ignore[no-untyped-def]
+        """out += a @ b, for the tile of ``out`` that begins at (row, column). Its sums stay in registers: LLVM would not find that."""
+
+        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+            row, inner, column = args[3:]
+            zero = ir.Constant(_I64, 0)
+            rows = [ir.Constant(_I64, r) for r in range(height)]
+            columns = [ir.Constant(_I64, 4 * TILE_COLS * v) for v in range(vectors)]
+
+            def after(address, stride, count, kind):  # type: ignore[no-untyped-def]
+                return builder.bitcast(builder.gep(address, [builder.mul(stride, count)]), kind.as_pointer())
+
+            def vector(address, offset):  # type: ignore[no-untyped-def]
+                return builder.bitcast(builder.gep(address, [offset]), _VECTOR.as_pointer())
+
+            left, down, along = element(context, builder, signature.args[0], args[0], row, zero)
+            right, onward, _ = element(context, builder, signature.args[1], args[1], zero, column)
+            tile, across, _ = element(context, builder, signature.args[2], args[2], row, column)
+            targets = [[vector(after(tile, across, r, _BYTE), c) for c in columns] for r in rows]
+            sums = [[cgutils.alloca_once_value(builder, builder.load(t, align=4)) for t in line] for line in targets]
+            with cgutils.for_range(builder, inner) as loop:
+                begin = after(right, onward, loop.index, _BYTE)
+                factors = [builder.load(vector(begin, c), align=4) for c in columns]
+                values = builder.gep(left, [builder.mul(along, loop.index)])
+                for r, line in zip(rows, sums, strict=True):
+                    value = splat(builder, builder.load(after(values, down, r, ir.FloatType())), _VECTOR)
+                    for factor, total in zip(factors, line, strict=True):
+                        product = builder.fmul(value, factor, flags=("contract",))
+                        builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+            for line, totals in zip(targets, sums, strict=True):
+                for target, total in zip(line, totals, strict=True):
+                    builder.store(builder.load(total), target, align=4)
+            return context.get_dummy_value()
+
+        return types.void(a, b, out, row, inner, column), codegen
+
+    return add_tile
+
+
+_high_and_wide, _high, _wide, _small = _tile(8, 2), _tile(8, 1), _tile(4, 2), _tile(4, 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def]
+    """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
+    row = 0
+    while row < rows:
+        high = row + 8 <= rows
+        column = 0
+        while column < columns:
+            wide = column + 2 * TILE_COLS <= columns
+            if high and wide:
+                _high_and_wide(a, b, out, row, inner, column)
+            elif high:
+                _high(a, b, out, row, inner, column)
+            elif wide:
+                _wide(a, b, out, row, inner, column)
+            else:
+                _small(a, b, out, row, inner, column)
+            column += 2 * TILE_COLS if wide else TILE_COLS
+        row += 8 if high else TILE_ROWS
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def clear(out, rows, columns):  # type: ignore[no-untyped-def]
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = np.float32(0.0)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def whole(count, of):  # type: ignore[no-untyped-def]
+    """``count`` rounded up to a multiple."""
+    return (count + of - 1) // of * of
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def padded(matrix):  # type: ignore[no-untyped-def]
+    """A copy of whole tiles, whichever way round it is used."""
+    return padded_to(matrix, whole(matrix.shape[0], TILE_COLS), whole(matrix.shape[1], TILE_COLS))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def padded_to(matrix, rows, columns):  # type: ignore[no-untyped-def]
+    """A copy with so many rows and columns, the new ones full of zeros."""
+    out = np.zeros((rows, columns), np.float32)
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[i, j] = matrix[i, j]
+    return out

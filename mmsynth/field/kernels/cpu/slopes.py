@@ -1,0 +1,133 @@
+"""The pull of the distance's slope towards one, at points and near what rays meet: the surface's gradient by four taps."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from mmsynth.field.kernels.cpu.blocks import surface_block, surface_block_backward
+from mmsynth.field.kernels.cpu.marching import CHUNK, contract
+from mmsynth.field.kernels.learning import TAPS
+
+POINTS = 64  # of all space, in a task
+TAPPED = 32  # points of a block, which are four positions each
+MOST_TAPPED = 2 * CHUNK  # points of a chunk
+_TAPS = np.array(TAPS, np.float32)
+_f = np.float32
+_ZERO, _ONE = _f(0.0), _f(1.0)
+
+
+class TapStore(NamedTuple):
+    """Of points at which the surface's gradient is asked for, a slot per chunk: block (see ``blocks``), four rows a point; used: rows; the
+    weights' gradients."""
+
+    block: np.ndarray
+    used: np.ndarray
+    turned_out: np.ndarray
+    output_out: np.ndarray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: ignore[no-untyped-def]
+    """See ``learning.surface_gradient``: of n points ``at`` (n, 3), whose taps are kept in the slot of ``taps`` behind what is there."""
+    move, scale = epsilon / _f(math.sqrt(3.0)), _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
+    values = np.empty(4 * TAPPED, np.float32)
+    for begin in range(0, n, TAPPED):
+        count, used = np.int64(min(TAPPED, n - begin)), np.int64(taps.used[slot, 0])
+        block = taps.block[slot, used:]
+        for i in range(count):
+            for t in range(4):
+                row = 4 * i + t
+                for a in range(3):
+                    block[row, a] = at[begin + i, a] + move * _TAPS[t, a]
+                block[row, 3] = _ONE
+        surface_block(block, hidden[used:], values, 4 * count, grid, surface)
+        for i in range(count):
+            for a in range(3):
+                total = _ZERO
+                for t in range(4):
+                    total += values[4 * i + t] * _TAPS[t, a]
+                found[begin + i, a] = total * scale
+        taps.used[slot, 0] = used + 4 * count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  # type: ignore[no-untyped-def]
+    """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
+    scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
+    values = np.empty(4 * TAPPED, np.float32)
+    for begin in range(0, n, TAPPED):
+        count, used = np.int64(min(TAPPED, n - begin)), first + 4 * begin
+        for i in range(count):
+            for t in range(4):
+                total = _ZERO
+                for a in range(3):
+                    total += g[begin + i, a] * _TAPS[t, a]
+                values[4 * i + t] = total * scale
+        surface_block_backward(
+            taps.block[slot, used:], hidden[used:], values, 4 * count, grid.active, surface, taps.turned_out[slot],
+            taps.output_out[slot],
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pull_to_one(slope, factor, shallow, g):  # type: ignore[no-untyped-def]
+    """``factor`` (|slope| - 1)², times ``shallow`` below 1; its gradient is added to g (3,)."""
+    norm = _f(math.sqrt(slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2]))
+    off = norm - _ONE
+    factor *= shallow if off < _ZERO else _ONE
+    if norm > _ZERO:
+        for a in range(3):
+            g[a] += _f(2.0) * factor * off * slope[a] / norm
+    return np.float64(factor * off * off)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def is_within(p):  # type: ignore[no-untyped-def]
+    return math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) < _ONE
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, scratch, slot, taps):  # type: ignore[no-untyped-def]
+    """The pull at some of the points of all space: its part of the loss."""
+    at, found = points[begin : begin + count], scratch.found[slot]
+    taps.used[chunk, 0] = 0
+    taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
+    slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
+    loss, g = 0.0, np.zeros((count, 3), np.float32)
+    for i in range(count):
+        loss += pull_to_one(found[i], factor, eikonal.shallow if is_within(at[i]) else _ONE, g[i])
+    slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
+    return loss
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps):  # type: ignore[no-untyped-def]
+    """The pull near the surfaces that some of the rays meet (see ``learning.asked_rays``): its part of the loss."""
+    wide, n, asked = grid.extent > _ONE, np.int64(0), np.int64(min(len(eikonal.noise), total))
+    at, found, shallow = scratch.at[slot], scratch.found[slot], scratch.shallow[slot]
+    for q in range(asked):
+        i = q * total // asked - begin
+        if i < 0 or i >= count or not math.isfinite(depth[i]):
+            continue
+        t = depth[i]
+        px, py, pz = (
+            rays.origins[i, 0] + rays.directions[i, 0] * t,
+            rays.origins[i, 1] + rays.directions[i, 1] * t,
+            rays.origins[i, 2] + rays.directions[i, 2] * t,
+        )
+        if wide:
+            px, py, pz, _ = contract(px, py, pz)
+        at[n, 0], at[n, 1], at[n, 2] = px + eikonal.noise[q, 0], py + eikonal.noise[q, 1], pz + eikonal.noise[q, 2]
+        shallow[n] = eikonal.shallow if is_within(at[n]) else _ONE
+        n += 1
+    slopes(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
+    loss = 0.0
+    for i in range(n):
+        at[i, 0], at[i, 1], at[i, 2] = _ZERO, _ZERO, _ZERO
+        loss += pull_to_one(found[i], factor, shallow[i], at[i])
+    slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
+    return loss

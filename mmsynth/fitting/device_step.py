@@ -1,0 +1,312 @@
+"""A step of a fit on a GPU, without the host: rays are drawn there, learned from and judged there, and the optimiser steps there.
+
+The host says what changes from step to step by the arguments of one small kernel and starts a graph, one for each ``Stage`` of the fit. It
+reads what the device tells of its steps from time to time, when that has arrived: the number of rays follows the samples that late. A step
+whose loss or gradients are not finite is not taken, which the device decides, too.
+
+All parameters but the tables lie in one array, with their gradients and moments in others: one kernel steps them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmsynth.field import kernels, rendering
+from mmsynth.field.field import MIRROR_CELLS, Field
+from mmsynth.field.kernels.cuda import drawing, optimiser, stepping
+from mmsynth.field.kernels.cuda.learning import learn_all
+from mmsynth.fitting import importance
+from mmsynth.fitting.graphs import Repeated
+from mmsynth.fitting.importance import Importance
+from mmsynth.fitting.measurements import Measurements
+from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.optimiser import BETAS, EPSILON, Adam
+from mmsynth.fitting.recipe import Recipe
+
+SAMPLES = 1 << 18  # of a step, at the least: with fewer a GPU idles between kernels
+MOST_RAYS = 1 << 18
+_NEWS_EVERY = 16  # steps
+_AHEAD = 2  # times that, by which the host is ahead of the device at the most: a fit of so many seconds does not end later
+_PER_OCTAVE = 4  # numbers of rays for which there are graphs: within 10 % of what is asked for
+_TABLES = {"surface.grid.table": 1, "appearance.table": 0}  # and which of ``Numbers.factors`` is theirs
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a graph is captured for: all that changes shapes or which kernels there are.
+
+    Attributes:
+        active: levels of surface and radiance. degrees: of direction, of each modality. lamps: those that there are. far_light, gains:
+            whether there are. early: whether slopes below 1 count less. rays, outside: of each modality, those drawn and those where
+            nothing is.
+    """
+
+    active: tuple[int, int]
+    degrees: tuple[int, ...]
+    lamps: tuple[int, ...]
+    far_light: bool
+    gains: bool
+    early: bool
+    rays: tuple[int, ...]
+    outside: tuple[int, ...]
+
+
+class News(NamedTuple):
+    """Of some steps together: how many, how many of them were bad, samples; of a good one the mean loss and squared error per modality, NaN
+    where none was good."""
+
+    steps: int
+    bad: int
+    samples: int
+    loss: float
+    errors: dict[str, float]
+
+
+class _Flat(NamedTuple):
+    """Parameters, gradients, moments, rates, one after the other, and which of ``Numbers.factors`` multiplies a rate (uint8)."""
+
+    values: Tensor
+    gradient: Tensor
+    first: Tensor
+    second: Tensor
+    rates: Tensor
+    kinds: Tensor
+
+
+def _gradient(parameter: Tensor) -> Tensor:
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter)
+    return parameter.grad
+
+
+def bucket(rays: float) -> int:
+    """The nearest number of rays for which there are graphs."""
+    return round(2.0 ** (round(_PER_OCTAVE * np.log2(max(rays, 1.0))) / _PER_OCTAVE))
+
+
+class DeviceStep:
+    """The steps of one fit on its device.
+
+    The field's parameters and the optimiser's moments become parts of its arrays; ``sync`` brings the optimiser's count up to date.
+
+    Args:
+        capture: whether stages become graphs.
+    """
+
+    samples, most_rays, first_rays = SAMPLES, MOST_RAYS, SAMPLES // 64  # a ray of the first step takes that many samples or more
+
+    def __init__(
+        self,
+        field: Field,
+        measurements: Measurements,
+        where: Importance,
+        adam: Adam,
+        log_gain: Tensor,
+        needs: Needs,
+        recipe: Recipe,
+        seed: int,
+        capture: bool = True,
+    ) -> None:
+        self.field, self.measurements, self.where, self.adam = field, measurements, where, adam
+        self.log_gain, self.needs, self.recipe, self.seed, self.capture = log_gain, needs, recipe, seed, capture
+        device = field.device
+        self.order = measurements.order
+        columns = [field.shader.columns[n].start for n in self.order]
+        self.modalities = measurements.modalities._replace(output=torch.tensor(columns, dtype=torch.int32, device=device))
+        self.values = [measurements[n].values for n in self.order]
+        self.polarized = [measurements[n].sensor.is_polarization for n in self.order]
+        self.selection = self._selection()
+        self.numbers = stepping.new_numbers(device)
+        self.steps = torch.tensor([0, adam.count], dtype=torch.int32, device=device)
+        self.told = torch.zeros(4 + len(self.order), dtype=torch.float64, device=device)
+        self.read = np.zeros(len(self.told))
+        self.copies: list[tuple[Tensor, torch.cuda.Event | None]] = []
+        self.flat, self.begins = self._flatten()
+        self.rates = {n: torch.full((1,), adam.rates[n], device=device) for n in _TABLES}
+        self.works: dict[Stage, Repeated] = {}
+        self.pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        self.tables: list[int] = []
+        self.lamps: tuple[int, ...] = ()
+        self.renew()
+
+    def _selection(self) -> kernels.Selection:
+        """Where rays are drawn, in arrays that stay."""
+        return self.where.selection._replace(ends=self.where.selection.ends.clone(), weight=self.where.selection.weight.clone())
+
+    def _flatten(self) -> tuple[_Flat, dict[str, int]]:
+        """Lay the small parameters one after the other, the shader's first, in the order that ``learn_all`` sums; where each begins."""
+        shader, light = list(self.field.shader.parameters()), self.field.light
+        first = [*shader, *([] if self.field.far_light is None else [self.field.far_light])]
+        first += [] if light is None else [*light.network()[:6]]
+        place = {id(p): i for i, p in enumerate(first)}
+        names = [n for n in self.adam.parameters if n not in _TABLES]
+        names.sort(key=lambda n: place.get(id(self.adam.parameters[n]), len(place)))
+        parts = [self.adam.parameters[n] for n in names]
+        sizes = [p.numel() for p in parts]
+        join = lambda tensors: torch.cat([x.detach().reshape(-1) for x in tensors])
+        moments = [[self.adam.moments[n][k] for n in names] for k in (0, 1)]
+        rates = [torch.full((size,), self.adam.rates[n], device=self.field.device) for n, size in zip(names, sizes, strict=True)]
+        kinds = [torch.full_like(rate, n.startswith("surface."), dtype=torch.uint8) for n, rate in zip(names, rates, strict=True)]
+        values = join(parts)
+        flat = _Flat(values, torch.zeros_like(values), *map(join, moments), torch.cat(rates), torch.cat(kinds))
+        begins, begin = {}, 0
+        for name, p, size in zip(names, parts, sizes, strict=True):
+            own = [x[begin : begin + size].view(p.shape) for x in flat[:4]]
+            p.data, p.grad, self.adam.moments[name], begins[name] = own[0], own[1], own[2:], begin
+            begin += size
+        return flat, begins
+
+    def stage(self, sampling: kernels.Sampling, rays: float, decided: bool, gains: bool, early: bool, outside: int) -> Stage:
+        """Of a step with so many rays of all modalities, and one in ``outside`` as many where nothing is.
+
+        Args:
+            decided: whether far light is seen. gains: whether exposures differ. early: whether slopes below 1 count less.
+        """
+        share = [self.needs.share[n] for n in self.order]
+        counts = tuple(max(1, int(bucket(rays) * s / sum(share))) for s in share)
+        empty = tuple(-(-c // outside) if self.measurements[n].empty else 0 for n, c in zip(self.order, counts, strict=True))
+        light = self.field.light
+        return Stage(
+            (sampling.active_surface, sampling.active_radiance), tuple(self.field.view_dependence[n] for n in self.order),
+            self.lamps if light is not None else (), decided and self.field.far_light is not None, gains, early, counts, empty,
+        )  # fmt: skip
+
+    def renew(self) -> None:
+        """Take up what was changed between steps: where rays go, lamps, tables of other sizes."""
+        self.selection.ends.copy_(self.where.selection.ends)
+        self.selection.weight.copy_(self.where.selection.weight)
+        light = self.field.light
+        self.lamps = () if light is None else tuple(torch.nonzero(light.used)[:, 0].tolist())
+        tables = [self.adam.parameters[n].data_ptr() for n in _TABLES]
+        if tables != self.tables:
+            self.works.clear()  # their arrays are gone
+        self.tables = tables
+
+    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, surface_factor: float) -> None:
+        """A step.
+
+        Args:
+            number: of the step, for its random numbers. factor: of all learning rates. surface_factor: of the surface's, beside.
+        """
+        if stage not in self.works:
+            self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture, self.pool)
+        key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
+        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, surface_factor, key)
+        self.works[stage]()
+        if (number + 1) % _NEWS_EVERY == 0:
+            self._tell()
+
+    def _work(self, stage: Stage, sampling: kernels.Sampling) -> Callable[[], None]:
+        """What a step of a stage does, with arrays that stay."""
+        field, numbers, m, loss = self.field, self.numbers, self.measurements, self.recipe.loss
+        device, grid = field.device, field.surface.grid
+        ints = lambda values, dtype=torch.int32: torch.tensor(values, dtype=dtype, device=device)
+        begins = [drawing.begins_of(self.values, self.polarized, counts) for counts in (stage.rays, stage.outside)]
+        tables = stepping.Tables(
+            ints(self.values), ints(stage.degrees), ints([n not in self.needs.sparse for n in self.order]), ints(begins[0], torch.int64)
+        )
+        of_outside = ints(begins[1], torch.int64)
+        sizes = [(b[0][-1], b[1][-1], b[2][-1], max(counts)) for b, counts in zip(begins, (stage.rays, stage.outside), strict=True)]
+        rays, outside = sizes[0][0], sizes[1][0]
+        has_opacity = any(x.has_opacity for x in m.values())
+        known = stepping.Known(
+            loss.alpha_weight / rays, loss.alpha_weight / max(outside, 1), loss.background_opacity_weight / rays,
+            has_opacity or self.needs.black_background, self.needs.black_background and not has_opacity,
+        )  # fmt: skip
+        bounds, contracted = (rendering.NEAR, rendering.FREE, rendering.FARTHEST), grid.extent > 1.0
+        points = loss.eikonal_points if loss.eikonal_weight > 0 else 0
+        free = points // 4
+        asked = 0 if stage.lamps else points - free
+        cell = grid.cell(stage.active[0])
+        shallow = loss.eikonal_shallow_early if stage.early else 1.0
+        surface, appearance = field.surface.at(stage.active[0]), field.appearance.at(stage.active[1])
+        none = torch.empty(0, device=device)
+        shader = field.shader.weights()
+        network = kernels.LightNetwork(*[none] * 6, ints([], torch.int64))
+        if field.light is not None and stage.lamps:
+            network = field.light.network()._replace(used=ints(stage.lamps, torch.int64))
+        far_light = field.far_light if stage.far_light and field.far_light is not None else none
+        of_shader = self.flat.gradient[: sum(w.numel() for w in (*shader, far_light))]
+        light_begin = self.begins.get("light.first.weight", 0)
+        of_light = self.flat.gradient[light_begin : light_begin + sum(w.numel() for w in network[:6])]
+        log_gain = self.log_gain if stage.gains else none
+        now = sampling._replace(sharpness=numbers.sharpness, step=numbers.step)  # type: ignore[arg-type]
+        rows = {
+            "surface.grid.table": int(grid.offsets[stage.active[0]]),
+            "appearance.table": int(field.appearance.offsets[stage.active[1]]),
+        }
+        whole = lambda *shape: torch.empty(shape, device=device)
+
+        def work() -> None:
+            origins, directions, jitter = whole(rays + outside, 3), whole(rays + outside, 3), whole(rays + outside)
+            drawn = drawing.draw_all(
+                m.frames, m.cameras, self.modalities, self.selection, tables.begins, sizes[0], len(self.order), numbers.key[:2],
+                (origins[:rays], directions[:rays], jitter[:rays]),
+            )  # fmt: skip
+            if m.empty is not None and outside:
+                drawing.draw_all(
+                    m.frames, m.cameras, self.modalities, m.empty, of_outside, sizes[1], 1, numbers.key[2:],
+                    (origins[rays:], directions[rays:], jitter[rays:]),
+                )  # fmt: skip
+            aimed, view, opacities = stepping.aim(drawn, origins, directions, jitter, tables, known, bounds, contracted)
+            at, noise = stepping.random_points(numbers, free, asked, grid.extent, 3.0)
+            eikonal = kernels.Eikonal(at, noise, loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow)
+            learned = learn_all(
+                *surface, appearance, field.occupancy.states, shader, network, far_light, aimed, view, drawn.measured,
+                kernels.Gains(log_gain, drawn.frame), opacities, eikonal, now, of_shader, of_light,
+            )  # fmt: skip
+            f = self.flat
+            optimiser.check(learned.loss, f.gradient, learned.samples, self.steps, self.told[:4])
+            optimiser.guarded_adam(f.values, f.gradient, (f.first, f.second), f.rates, f.kinds, numbers.factors, self.steps, BETAS, EPSILON)
+            for name, kind in _TABLES.items():
+                p, moments = self.adam.parameters[name], self.adam.moments[name]
+                optimiser.guarded_adam(
+                    p[: rows[name]], _gradient(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, numbers.factors,
+                    self.steps, BETAS, EPSILON, sparse=True,
+                )  # fmt: skip
+            stepping.tally(drawn, learned.squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)
+
+        return work
+
+    def _tell(self) -> None:
+        """Send what the device tells on its way; the host is never more than ``_AHEAD`` times that far ahead of it."""
+        while len(self.copies) > _AHEAD and self.copies[0][1] is not None:
+            self.copies.pop(0)[1].synchronize()
+        if self.told.device.type == "cpu":
+            self.copies.append((self.told.clone(), None))
+            return
+        copy = torch.empty(self.told.shape, dtype=self.told.dtype, pin_memory=True)
+        copy.copy_(self.told, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record(torch.cuda.current_stream(self.told.device))
+        self.copies.append((copy, event))
+
+    def news(self, wait: bool = False) -> News | None:
+        """What has arrived since the last time, None: nothing. ``wait``: for all that was done until now."""
+        if wait:
+            self._tell()
+            if self.copies[-1][1] is not None:
+                self.copies[-1][1].synchronize()
+        latest = None
+        while self.copies and (self.copies[0][1] is None or self.copies[0][1].query()):
+            latest = self.copies.pop(0)[0].numpy()
+        if latest is None or not (more := latest - self.read)[0]:
+            return None
+        self.read = latest.copy()
+        good = more[0] - more[1]
+        mean = lambda total: float(total / good) if good else float("nan")
+        return News(int(more[0]), int(more[1]), int(more[2]), mean(more[3]), dict(zip(self.order, map(mean, more[4:]), strict=True)))
+
+    def sync(self) -> None:
+        """Wait for the device, and let the optimiser know how often it stepped."""
+        self.adam.count = int(self.steps[1])
+
+    def resume(self) -> None:
+        """Begin from the optimiser's count, after its state was read."""
+        self.steps[1] = self.adam.count

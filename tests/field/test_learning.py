@@ -1,0 +1,145 @@
+"""A whole step, fused, against its definition in float64."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from mmsynth.field import kernels
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.kernels import learning
+from mmsynth.field.kernels.learning import learn
+from mmsynth.field.light import Light
+from mmsynth.field.occupancy import Occupancy
+from mmsynth.field.radiance import Shader
+from mmsynth.field.rendering import interval
+from mmsynth.field.surface import Surface
+from mmsynth.scene.scene import Sensor
+
+SENSORS = {
+    "rgb": Sensor("rgb", ("R", "G", "B"), (None,) * 3),
+    "pol": Sensor("pol", ("0", "45", "90", "135"), (None,) * 4, polarizer_angles_deg=(0.0, 45.0, 90.0, 135.0)),
+}
+RAYS = 300  # more than a chunk
+
+
+def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sparse: bool, extra: int = 0) -> dict[str, Any]:
+    """What a step takes, on an uneven ball; ``extra`` rays have no measurement."""
+    torch.manual_seed(0)
+    surface, appearance = Surface(HashGrid(3, 10, 6, 24, extent), 8, (0.5, 1.7 if extent > 1 else 1e9)), HashGrid(3, 11, 8, 32, extent)
+    nn.init.normal_(surface.grid.table, std=0.1)
+    nn.init.normal_(surface.output_weight, std=0.15)
+    nn.init.normal_(appearance.table)
+    shader = Shader(appearance.width, 24, SENSORS, dict.fromkeys(SENSORS, 0.5))
+    light = Light(appearance.width, shader.heads.out_features)
+    if lamps:
+        light.add(torch.tensor([[1.5, 2.0, -1.0], [-2.0, 0.5, 1.5], [0.0, -2.0, 2.0]])[:lamps])
+        nn.init.normal_(light.log_spectrum, std=0.3)
+        nn.init.normal_(light.second.weight, std=0.3)
+        light.used[1 if lamps > 2 else 0] = lamps <= 2  # used lamps need not be the first
+    occupancy = Occupancy(24, extent)
+    occupancy.update(lambda x: surface(x, 3), 30.0, torch.Generator().manual_seed(0), 1.0)
+    count = RAYS + extra
+    origins = nn.functional.normalize(torch.randn(count, 3), dim=1) * 1.6
+    directions = nn.functional.normalize(0.35 * torch.randn(count, 3) - origins, dim=1)
+    near, far_end = interval(surface, origins, directions)
+    polarized = RAYS // 3
+    ray = torch.cat([torch.arange(RAYS - polarized).repeat_interleave(3), torch.arange(RAYS - polarized, RAYS)])
+    output = torch.cat([torch.arange(3).repeat(RAYS - polarized), torch.full((polarized,), 3)])
+    axes = nn.functional.normalize(torch.randn(polarized, 3), dim=1)
+    numbers = len(ray)
+    measured = kernels.Measured(
+        torch.rand(numbers), ray, output, axes, torch.full((numbers,), 0.5), torch.full((numbers,), 0.9), torch.rand(numbers) / numbers
+    )
+    frames = torch.nn.Parameter(0.2 * torch.randn(5) if gains else torch.empty(0))
+    return {
+        "surface": surface,
+        "appearance": appearance,
+        "shader": shader,
+        "light": light,
+        "far_light": nn.Parameter(torch.randn(appearance.width) if far else torch.empty(0)),
+        "states": occupancy.states,
+        "rays": kernels.Rays(origins, directions, near, far_end, torch.rand(count)),
+        "view": kernels.View(torch.randint(4, (count,)), torch.rand(count) > 0.3 if sparse else torch.ones(count, dtype=torch.bool)),
+        "measured": measured,
+        "gains": kernels.Gains(frames, torch.randint(5, (numbers,))),
+        "opacities": kernels.Opacities(*(torch.rand(3, count) / count if opacities else torch.empty(3, 0))),
+        "eikonal": kernels.Eikonal(
+            (torch.rand(100, 3) * 2 - 1) * extent, torch.empty(0, 3) if lamps else 0.05 * torch.randn(120, 3), 0.1, 0.08, 0.16, 0.3
+        ),
+        "sampling": kernels.Sampling(30.0, 2 / 30, 3, 3),
+    }
+
+
+def _run(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Learned, dict[str, Tensor]]:
+    """What was learned, and all gradients by name."""
+    modules = {n: m.to(dtype) for n, m in step.items() if isinstance(m, nn.Module)}
+    for m in modules.values():
+        m.zero_grad()
+    cast = lambda x: x.to(dtype) if isinstance(x, Tensor) and x.is_floating_point() else x
+    tuples = {n: type(x)(*map(cast, x)) for n, x in step.items() if isinstance(x, tuple)}
+    far_light, log_gain = (nn.Parameter(x.detach().to(dtype)) for x in (step["far_light"], step["gains"].log_gain))
+    grid, network = modules["surface"].at(3)
+    found = (kernels.learn if dtype == torch.float32 else learn)(
+        grid, network, modules["appearance"].at(3), step["states"], modules["shader"].weights(), modules["light"].network(), far_light,
+        tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
+        tuples["eikonal"], step["sampling"],
+    )  # fmt: skip
+    parameters = {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
+    return found, {n: p.grad.clone() for n, p in parameters.items() if p.grad is not None and p.numel()}
+
+
+CASES = {
+    "plain": (1.0, 0, False, False, False, False),
+    "background": (2.0, 0, False, True, False, False),
+    "lamps and background": (2.0, 2, False, True, False, True),
+    "far light": (1.0, 0, True, False, True, False),
+    "lamps": (1.0, 2, False, False, False, False),
+    "all": (1.0, 3, True, True, True, True),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_is_that_of_the_definition(case: str) -> None:
+    step = _step(*CASES[case], extra=70 if case == "far light" else 0)
+    truth, expected = _run(step, torch.float64)
+    found, gradients = _run(step, torch.float32)
+    assert abs(found.loss.item() - truth.loss.item()) < 2e-5 * truth.loss.item()
+    assert abs(int(found.samples) - int(truth.samples)) <= 2  # a step may round to the other side of a cell's face
+    assert set(expected) == set(gradients)
+    for name, g in expected.items():
+        off = (gradients[name].double() - g).abs().max() / g.abs().max().clamp(min=1e-12)
+        assert off < 5e-3, (name, off)
+    assert all(g.abs().max() > 0 for n, g in expected.items()), [n for n, g in expected.items() if not g.abs().max() > 0]
+
+
+def test_sums_do_not_depend_on_threads() -> None:
+    import numba
+
+    step = _step(*CASES["all"])
+    before, results = numba.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+            results.append(_run(step, torch.float32))
+    finally:
+        numba.set_num_threads(before)
+    assert results[0][0].loss == results[1][0].loss
+    assert all(torch.equal(g, results[1][1][n]) for n, g in results[0][1].items())
+
+
+def test_far_light_is_what_a_ray_without_surface_shows() -> None:
+    hits = kernels.Hits(
+        torch.zeros(1, 4),
+        torch.zeros(1),
+        torch.zeros(1),
+        torch.full((1,), -1),
+        torch.zeros(1),
+        torch.full((1,), torch.nan),
+        torch.tensor(0),
+    )
+    shaded = learning.with_far_light(hits, torch.ones(4))
+    assert torch.equal(shaded.features, torch.ones(1, 4)) and shaded.share.item() == 1.0
