@@ -135,8 +135,8 @@ def fit(
         live = LiveView(loaded, port, say) if view else None
         fitted = fit_run(
             loaded, run, recipe=recipe, steps=steps, budget=seconds, seed=seed, device=pick_device(device), resume=resume,
-            prior=of_scenes, exposure=stated, on_load=on_load, checkpoint_every=every, on_start=lambda needs: explain(needs.choices),
-            on_step=on_step,
+            prior=of_scenes, exposure=stated, checkpoint_every=every, on_load=on_load,
+            on_start=lambda needs: explain(needs.choices), on_step=on_step,
             on_field=live,
         )  # fmt: skip
         if live is not None:

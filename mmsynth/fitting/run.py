@@ -55,8 +55,8 @@ def fit(
     resume: bool = False,
     prior: Prior | None = None,
     exposure: Exposure | None = None,
-    on_load: OnLoad | None = None,
     checkpoint_every: float = CHECKPOINT_EVERY,
+    on_load: OnLoad | None = None,
     on_start: Callable[[Needs], None] | None = None,
     on_step: Callable[[FitProgress], None] | None = None,
     on_field: Callable[[Field], None] | None = None,
@@ -69,8 +69,8 @@ def fit(
             checkpoint was planned for, else 60 s.
         device: cpu or cuda. resume: go on from the run's checkpoint, if it has one.
         prior: to predict modalities that the scene lacks. exposure: of the scene; None: what it states.
-        on_load: called as frames are read, with how many were and how many there are.
         checkpoint_every: seconds.
+        on_load: called as frames are read, with how many were and how many there are.
         on_start: called once with what the scene was found to need. on_step: called after every step. on_field: called then with the field
             as it is, which it may render.
     Raises:

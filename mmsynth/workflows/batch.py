@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from mmsynth.errors import InputError, known_error
+from mmsynth.errors import InputError, OutOfMemoryError, known_error
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
 from mmsynth.files import write_json
@@ -91,11 +89,11 @@ def run_batch(
             outcome = _fit_and_generate(scene, out / name, job)
             shown = ", ".join(f"{n} {v:.1f}" for n, v in outcome["train_psnr"].items())
             say(f"{name}: {shown} dB on training pixels, {time.perf_counter() - began:.0f} s")
-        except torch.OutOfMemoryError:
-            outcome = {"error": f"{scene}: does not fit into the memory of one GPU, and a scene is not split over several."}
         except Exception as error:  # one scene must not take the others down, whatever it is
             known = known_error(error, str(scene))
             outcome = {"error": f"{scene}: {type(error).__name__}: {error}" if known is None else str(known)}
+            if isinstance(known, OutOfMemoryError) and "CUDA" in str(known):
+                outcome = {"error": f"{scene}: does not fit into the memory of one GPU, and a scene is not split over several."}
         if "error" in outcome:
             say(f"{name}: failed: {outcome['error']}")
         outcomes[name] = {"scene": str(scene), "seconds": time.perf_counter() - began, **outcome}
