@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,13 +20,13 @@ from mmsynth.field.kernels.learning import normals, with_far_light
 from mmsynth.field.kernels.mirroring import material
 from mmsynth.field.light import Light, mean_spectrum, stokes, stokes_around
 from mmsynth.field.occupancy import Occupancy
-from mmsynth.field.picture import Rendering
+from mmsynth.field.picture import Rendering, picture_of
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
-from mmsynth.sensors.camera import Camera, unproject
+from mmsynth.sensors.camera import Camera, rays_by_parts
 from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 
 TILE = 8192  # rays at a time: what they need stays in the caches
@@ -353,12 +354,8 @@ class Field(nn.Module):
         pixels, valid = camera.width * camera.height, np.zeros(camera.width * camera.height, bool)
         images: dict[str, np.ndarray] = {}
         forward = np.zeros(pixels, np.float32)
-
         # rays by parts: those of a whole picture of a full-size sensor would take more memory than what they show
-        for begin in range(0, pixels, _TILES * TILE):
-            index = np.arange(begin, min(begin + _TILES * TILE, pixels))
-            in_camera, seen = unproject(np.stack([index % camera.width, index // camera.width], -1).astype(np.float64), camera)
-            index, in_camera = index[seen], in_camera[seen]
+        for index, in_camera in rays_by_parts(camera, _TILES * TILE):
             valid[index], forward[index] = True, in_camera[:, 2]
             for start in range(0, len(index), TILE):
                 rows = index[start : start + TILE]
@@ -368,23 +365,16 @@ class Field(nn.Module):
                     images[key][rows] = value
                 if progress is not None:
                     progress(len(rows))
-
-        shape = (camera.height, camera.width)
-
-        def picture(key: str, channels: int, fill: float = np.nan) -> np.ndarray:
-            if key in images:
-                return images[key].reshape(*shape, channels)
-            return np.broadcast_to(np.float32(fill), (*shape, channels))  # of what nothing was seen: no memory
-
+        picture = functools.partial(picture_of, images, (camera.height, camera.width))
         depth = picture("depth", 1)[..., 0] * np.float32(self.region.radius)
         return Rendering(
             channels={n: picture(n, self.sensors[n].channel_count) for n in names},
             stokes={n: picture(f"stokes/{n}", 3) for n in names if self.sensors[n].is_polarization},
-            depth_z=depth * forward.reshape(shape),
+            depth_z=depth * forward.reshape(depth.shape),
             depth_ray=depth,
             normal=picture("normal", 3),
             opacity=picture("opacity", 1, 0.0)[..., 0],
-            valid=valid.reshape(shape),
+            valid=valid.reshape(depth.shape),
             deviation={n: picture(f"deviation/{n}", self.sensors[n].channel_count) for n in names if n in self.predicted},
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -50,3 +50,10 @@ def bands(shape: tuple[int, ...]) -> Iterator[slice]:
     step = max(1, _BAND // width)
     for top in range(0, height, step):
         yield slice(top, min(top + step, height))
+
+
+def picture_of(images: Mapping[str, np.ndarray], shape: tuple[int, int], key: str, channels: int, fill: float = np.nan) -> np.ndarray:
+    """Values (H W, ...) of all pixels as (H, W, channels); of what nothing was seen a picture of ``fill``, which takes no memory."""
+    if key in images:
+        return images[key].reshape(*shape, channels)
+    return np.broadcast_to(np.float32(fill), (*shape, channels))

@@ -35,25 +35,23 @@ What is undefined (no such truth, no pixel) is left out; there is no NaN in the 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from mmsynth.errors import InputError
 from mmsynth.field.picture import Rendering, bands
 from mmsynth.operations.evaluation.parts import PARTS, parts_of
 from mmsynth.operations.evaluation.perceptual import LARGE_ENOUGH, Distance, find_lpips, lpips_of_channels
+from mmsynth.operations.evaluation.visible_points import chamfer, seen_points
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.masks import read_mask
 from mmsynth.scene.scene import Frame, MaskMeaning, Scene, Sensor
-from mmsynth.sensors.camera import unproject
 from mmsynth.sensors.metrics import psnr_from_mse, spectral_angle_deg, ssim, ssim_of_channels
 from mmsynth.sensors.mosaic import channels_of, photosites_of
 from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_difference, degree_of_linear_polarization, stokes_to_intensities
@@ -61,7 +59,6 @@ from mmsynth.sensors.polarization import angle_of_linear_polarization, aolp_diff
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
 
-_POINTS = 1 << 18  # pixels of a picture whose points are compared
 _FOREGROUND_SOURCES = ("masks", "gt", "opacity")
 
 
@@ -188,8 +185,10 @@ def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
     if "depth_z" in shape and exam.metric:  # the truth is in metres
         _score_geometry(exam, rendering, shape, where)
         surface = where & rendering.valid
-        exam.points.append(_seen_points(exam.field, frame, rendering.depth_z, surface & np.isfinite(rendering.depth_z)))
-        exam.true_points.append(_seen_points(exam.field, frame, shape["depth_z"], surface & (shape["depth_z"] > 0)))
+        exam.points.append(
+            seen_points(frame.camera, exam.field.pose_of(frame), rendering.depth_z, surface & np.isfinite(rendering.depth_z))
+        )
+        exam.true_points.append(seen_points(frame.camera, exam.field.pose_of(frame), shape["depth_z"], surface & (shape["depth_z"] > 0)))
 
 
 def _components(sensor: Sensor) -> int:
@@ -355,29 +354,10 @@ def _score_geometry(exam: _Exam, rendering: Rendering, truth: dict[str, np.ndarr
 
 def _geometry(exam: _Exam) -> dict[str, float]:
     """All that is known of the surface's errors."""
-    out = _values(exam.geometry, ("depth_mae", "hit_rate")) | _chamfer(exam.points, exam.true_points)
+    out = _values(exam.geometry, ("depth_mae", "hit_rate")) | chamfer(exam.points, exam.true_points)
     errors = np.concatenate(exam.normal_errors) if exam.normal_errors else np.empty(0)
     errors = errors[np.isfinite(errors)]
     return out | ({"normal_mae_deg": float(errors.mean()), "normal_median_deg": float(np.median(errors))} if len(errors) else {})
-
-
-def _seen_points(field: Field, frame: Frame, depth_z: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """(N, 3) world points that pixels ``where`` see; of a large picture, those of every n-th row and column."""
-    step = math.ceil(math.sqrt(max(1.0, depth_z.size / _POINTS)))
-    v, u = np.mgrid[0 : depth_z.shape[0] : step, 0 : depth_z.shape[1] : step]
-    pixels = np.stack([u, v], -1)[where[::step, ::step]].astype(np.float64)
-    rays, _ = unproject(pixels, frame.camera)
-    pose, depth = field.pose_of(frame), depth_z[::step, ::step][where[::step, ::step]].astype(np.float64)
-    forward = np.where(rays[:, 2] > 0, rays[:, 2], np.nan)
-    return pose[:3, 3] + rays @ pose[:3, :3].T * (depth / forward)[:, None]
-
-
-def _chamfer(ours: list[np.ndarray], true: list[np.ndarray]) -> dict[str, float]:
-    """Mean nearest distance between two point clouds, both ways; nothing when one is empty."""
-    a, b = (np.concatenate(points) if points else np.empty((0, 3)) for points in (ours, true))
-    if not len(a) or not len(b):
-        return {}
-    return {"chamfer_visible": float(0.5 * (cKDTree(b).query(a)[0].mean() + cKDTree(a).query(b)[0].mean()))}
 
 
 def _values(scores: _Scores, keys: Sequence[str]) -> dict[str, Any]:

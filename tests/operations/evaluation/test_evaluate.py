@@ -15,7 +15,7 @@ from analytic import MS, RGB, AnalyticField, WrongField, scene_of, sphere
 from mmsynth.errors import InputError
 from mmsynth.field import picture
 from mmsynth.field.picture import Rendering
-from mmsynth.operations.evaluation import evaluate as evaluation
+from mmsynth.operations.evaluation import visible_points
 from mmsynth.operations.evaluation.evaluate import evaluate, raw_ssim
 from mmsynth.report.text import score_text
 from mmsynth.scene.image_writers import write_png16
@@ -77,7 +77,7 @@ def test_points_of_a_large_picture_are_some_of_its_points(tmp_path: Path, monkey
     scene = scene_of(AnalyticField(sphere()), tmp_path)
     shifted = Changed(lambda out: {"depth_z": out.depth_z + np.float32(0.01)}, sphere())
     whole = score(shifted, scene)["geometry"]
-    monkeypatch.setattr(evaluation, "_POINTS", 24 * 18 // 4)
+    monkeypatch.setattr(visible_points, "_POINTS", 24 * 18 // 4)
     some = score(shifted, scene)["geometry"]
     assert some["depth_mae"] == whole["depth_mae"] and some["chamfer_visible"] == pytest.approx(whole["chamfer_visible"], rel=0.25)
     assert score(AnalyticField(sphere()), scene)["geometry"]["chamfer_visible"] == 0.0
