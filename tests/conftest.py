@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
 
 WIDTH, HEIGHT = 24, 18
+sys.path.append(str(Path(__file__).parent / "field"))  # cases of the CPU's kernels are those of Triton's
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # two threads a process on two cores wait for each other at every barrier; a test may still ask for more
@@ -132,3 +134,44 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |" for cells in session.config.stash.get(_ROWS, [])]
     head = "# Hard cases\n\nMade by `pytest tests/hard_cases --hard-cases tests/hard_cases/README.md`: what the tests measured.\n\n"
     Path(target).write_text(head + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
+if INTERPRETED:
+    # the interpreter of triton 3.6 takes int() of arrays of one element for the bounds of a loop; numpy 2.4 has no such thing
+    from triton.runtime import interpreter
+
+    patch_tensor = interpreter._patch_lang_tensor
+
+    def patch_tensor_and_index(tensor: object, scope: interpreter._LangPatchScope) -> None:
+        patch_tensor(tensor, scope)
+        scope.set_attr(tensor, "__index__", lambda self: int(self.handle.data.item()))
+
+    interpreter._patch_lang_tensor = patch_tensor_and_index
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of the tests of Triton, those with a ``device`` need a GPU or the interpreter; the others have nothing to do with the interpreter."""
+    no_gpu = pytest.mark.skip(reason="needs a CUDA device")
+    for item in items:
+        if "field/cuda" not in item.path.as_posix():
+            continue
+        if "device" not in getattr(item, "fixturenames", ()):
+            if INTERPRETED:
+                item.add_marker(pytest.mark.skip(reason="has nothing to do with the interpreter"))
+        elif not INTERPRETED:
+            item.add_marker(pytest.mark.gpu)
+            if not torch.cuda.is_available():
+                item.add_marker(no_gpu)
+
+
+@pytest.fixture
+def device() -> str:
+    """Of the tests of Triton: a GPU where there is one, CPU tensors in Triton's interpreter.
+
+    Whether Triton compiles or interprets is decided when it is first imported. So the interpreter gets a process of its own (see
+    tests/field/cuda/test_cuda_availability.py), where these tests run a second time, with TRITON_INTERPRET=1.
+    """
+    torch.manual_seed(0)
+    return "cpu" if INTERPRETED else "cuda"

@@ -13,13 +13,14 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest import mock
 
 import torch
 from torch import Tensor
 
+from mmsynth.bench.launches import device_step, example_trainer, launch_table, step_launches
 from mmsynth.bench.machine import measure
 from mmsynth.bench.output import Report, write_report
+from mmsynth.bench.recording import Launch, recorded_launches
 from mmsynth.bench.roofline import roofline_table
 from mmsynth.bench.tables import Column, Table
 from mmsynth.errors import InputError
@@ -36,19 +37,6 @@ _TYPES = {
 }  # fmt: skip
 
 
-class Launch(NamedTuple):
-    """One call of a Triton kernel. arguments: by name, tensors, numbers and constants. programs: of its grid. options: of the compiler."""
-
-    kernel: Any
-    arguments: dict[str, Any]
-    programs: tuple[int, ...]
-    options: dict[str, int]
-
-    @property
-    def name(self) -> str:
-        return str(self.kernel.fn.__name__).removesuffix("_kernel")
-
-
 class Resources(NamedTuple):
     """Of a thread: registers; bytes that are stored to and loaded from local memory because registers did not suffice. Of a program:
     shared memory [byte]."""
@@ -56,22 +44,6 @@ class Resources(NamedTuple):
     registers: int
     spilled: int
     shared: int
-
-
-@contextlib.contextmanager
-def recorded_launches() -> Iterator[list[Launch]]:
-    """Within, launches of Triton kernels are kept in the list that this gives, and do not run: outputs are whatever memory held."""
-    from triton.runtime.jit import JITFunction
-
-    launches: list[Launch] = []
-
-    def run(kernel: Any, *args: Any, grid: Any, warmup: bool, **named: Any) -> None:
-        arguments = dict(zip(kernel.arg_names, args, strict=False)) | {k: v for k, v in named.items() if k in kernel.arg_names}
-        options = {k: v for k, v in named.items() if k not in kernel.arg_names}
-        launches.append(Launch(kernel, arguments, tuple(grid), {"num_warps": 4} | options))
-
-    with mock.patch.object(JITFunction, "run", run):
-        yield launches
 
 
 def compiled(launch: Launch, target: int) -> tuple[Resources, Any]:
@@ -176,7 +148,6 @@ def bench_gpu(out: Path, targets: Sequence[int] = tuple(TARGETS)) -> Report:
         import triton
     except ImportError:
         raise InputError("bench gpu: triton is not installed; pip install triton==3.6.0.") from None
-    from mmsynth.bench.launches import device_step, example_trainer, launch_table, step_launches
 
     trainer = example_trainer()
     launches = [launch for call in calls() for launch in launches_of(call)]

@@ -12,7 +12,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from mmsynth.bench.gpu import Launch, recorded_launches
+from mmsynth.bench.recording import Launch, recorded_launches
 from mmsynth.bench.tables import Column, Table
 from mmsynth.fitting.device_step import DeviceStep
 from mmsynth.fitting.recipe import Recipe

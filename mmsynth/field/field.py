@@ -233,6 +233,7 @@ class Field(nn.Module):
         mirrors = None if lamps is None else self.mirrors(hits, origins, directions, self.sampling.active_surface)[0]
         images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
         around = None if mirrors is None else kernels.surround(mirrors)
+        lit = hits.share if mirrors is None else mirrors.share  # of what has a place
         outputs = {d: self.shader(shaded.features, directions[ray], d) for d in {self.view_dependence[n] for n in modalities}}
 
         def together(values: Tensor, share: Tensor) -> Tensor:
@@ -251,7 +252,7 @@ class Field(nn.Module):
             if angles is None:
                 out[name] = together(self.shader.values(name, raw), shaded.share)
                 if lamps is not None and images is not None:
-                    mirrored = scale * together(images.amount @ lamps.spectrum[:, self.shader.columns[name]], hits.share)
+                    mirrored = scale * together(images.amount @ lamps.spectrum[:, self.shader.columns[name]], lit)
                     out[name] += mirrored
                     if light:
                         out[f"mirrored/{name}"] = mirrored
@@ -260,8 +261,8 @@ class Field(nn.Module):
             behind, vectors = self.shader.polarized(name, raw, x, y, torch.deg2rad(torch.tensor(angles, device=origins.device)))
             out[name], out[f"stokes/{name}"] = together(behind, shaded.share), together(vectors, shaded.share)
             if lamps is not None and images is not None and around is not None:
-                of_lamps = scale * together(stokes(images, lamps.spectrum[:, self.shader.columns[name].start], x, y), hits.share)
-                more = of_lamps + scale * together(stokes_around(around, x, y), hits.share)
+                of_lamps = scale * together(stokes(images, lamps.spectrum[:, self.shader.columns[name].start], x, y), lit)
+                more = of_lamps + scale * together(stokes_around(around, x, y), lit)
                 out[f"stokes/{name}"] += more
                 out[name] += stokes_to_intensities(more, angles)
                 if light:
@@ -269,7 +270,7 @@ class Field(nn.Module):
         if light and mirrors is not None:
             if lamps is not None and images is not None:
                 x, y = (axis[ray] for axis in reference_axes(directions, camera_x))
-                out["images"] = together(stokes(images, (lamps.spectrum / mean_spectrum(lamps.spectrum)).mean(1), x, y), hits.share)
+                out["images"] = together(stokes(images, (lamps.spectrum / mean_spectrum(lamps.spectrum)).mean(1), x, y), lit)
             of = material(mirrors.material)
             met = torch.where(hits.opacity > 0.5, hits.opacity, torch.full_like(hits.opacity, float("nan")))
             for key, value in (("roughness", of.roughness), ("strength", of.strength)):

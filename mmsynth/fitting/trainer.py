@@ -1,4 +1,7 @@
-"""The compact trainer: random rays of every modality, one field, one loss."""
+"""The compact trainer: random rays of every modality, one field, one loss.
+
+A step, what is due before it and what is kept of a fit stand in one file: they read and write the same state.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from torch.nn.functional import pad
 
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field import kernels, rendering
-from mmsynth.field.field import MIRROR_CELLS, Field
+from mmsynth.field.field import Field
 from mmsynth.field.light import Light
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
@@ -27,9 +30,10 @@ from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import blocked_weight, learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
+from mmsynth.fitting.terms import eikonal, opacities
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
 
@@ -307,43 +311,9 @@ class Trainer:
         return kernels.learn(
             *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
             field.shader.weights(), light.network(), far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
-            self._opacities(batch, outside), self._eikonal(count, sampling, generator), sampling,
+            opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
+            eikonal(field, sampling, self.recipe, self.progress, generator), sampling,
         )  # fmt: skip
-
-    def _opacities(self, batch: Batch, outside: int) -> kernels.Opacities:
-        """What is known of the opacity of a batch's rays, and that so many rays behind them meet nothing."""
-        recipe, rays, none = self.recipe.loss, len(batch.origins), batch.ray_weight.new_zeros
-        if not (self.has_opacity or self.needs.black_background):
-            return kernels.Opacities(none(0), none(0), none(0), none(0), 0.0)
-        target, weight, linear, blocked = (none(rays + outside) for _ in range(4))
-        weight[rays:] = recipe.alpha_weight / max(outside, 1)
-        solid = blocked_weight(self.progress, self.recipe)
-        blocked[rays:] = solid / max(outside, 1)
-        if self.has_opacity:
-            known = torch.isfinite(batch.alpha)
-            target[:rays] = torch.where(known, batch.alpha, target[:rays])
-            weight[:rays] = recipe.alpha_weight / rays * batch.ray_weight * known
-            blocked[:rays] = solid / rays * batch.ray_weight * (batch.alpha == 0.0)
-        else:
-            m = batch.measured
-            black = none(rays).scatter_reduce(0, m.ray, m.target / m.level, "amax") < 0.02
-            linear[:rays] = recipe.background_opacity_weight / rays * batch.ray_weight * black
-        return kernels.Opacities(target, weight, linear, blocked, math.exp(-self.recipe.sampling.max_optical_depth))
-
-    def _eikonal(self, rays: int, sampling: kernels.Sampling, generator: torch.Generator) -> kernels.Eikonal:
-        """Where the distance is pulled towards a true one: a quarter of the points in all space, the others within the soft surface, or at
-        all surfaces that rays meet where these shine, whose normals are known."""
-        grid, recipe = self.field.surface.grid, self.recipe
-        count = recipe.loss.eikonal_points if recipe.loss.eikonal_weight > 0 else 0
-        points = (torch.rand(count // 4, 3, generator=generator) * 2 - 1) * grid.extent
-        near = 0 if self.field.shines else count - len(points)
-        noise = torch.randn(near, 3, generator=generator) * (3.0 / sampling.sharpness)
-        cell = grid.cell(sampling.active_surface)
-        # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
-        shallow = recipe.loss.eikonal_shallow_early if self.progress < recipe.schedule.levels_until else 1.0
-        return kernels.Eikonal(
-            points.to(self.device), noise.to(self.device), recipe.loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow
-        )
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""

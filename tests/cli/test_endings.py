@@ -123,9 +123,9 @@ def test_a_frame_that_went_away(fitted: Path, tmp_path: Path, monkeypatch: pytes
     shutil.copytree(fitted / "scene", tmp_path / "scene")
     from mmsynth.fitting import measurements
 
-    load_frame, frame = measurements.load_frame, tmp_path / "scene/modalities/mono/0004.png"
+    read_frames, frame = measurements.read_frames, tmp_path / "scene/modalities/mono/0004.png"
     with monkeypatch.context() as now:
-        now.setattr(measurements, "load_frame", lambda *of: frame.unlink(missing_ok=True) or load_frame(*of))
+        now.setattr(measurements, "read_frames", lambda *of: frame.unlink(missing_ok=True) or read_frames(*of))
         refused(here(tmp_path, *FIT, "3"), "0004.png", "no such image file")
     assert not (tmp_path / "runs").exists()
     shutil.copy(fitted / "scene/modalities/mono/0004.png", frame)

@@ -102,7 +102,8 @@ def _case(count: int, modalities: tuple[Modality, ...] = ALL, width: int = 24, h
     share = torch.rand(rays + len(twice))
     share[:rays][torch.rand(rays) < 0.2] = 0.0
     batch = Batch(
-        origins=torch.zeros(rays, 3), directions=directions, frame=frame, parts=parts, alpha=alpha, ray_weight=torch.ones(rays), pixels={},
+        origins=torch.zeros(rays, 3), directions=directions, jitter=torch.zeros(rays), frame=frame, parts=parts, alpha=alpha,
+        ray_weight=torch.ones(rays), tile=torch.zeros(rays, dtype=torch.int64),
         measured=Measured(**joined, axes=torch.cat(axes) if axes else torch.empty(0, 3)),
     )  # fmt: skip
     gain = torch.rand(len(joined["ray"])) + 0.5 if gains else None

@@ -27,6 +27,7 @@ from mmsynth.fitting.measurements import draw, load_measurements
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
+from mmsynth.fitting.terms import eikonal
 from mmsynth.fitting.trainer import FitProgress, Trainer
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.packaged import data_folder
@@ -487,7 +488,7 @@ def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Calla
 def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, background: str) -> None:
     trainer = _trainer(scene, **{"surface.background": background})
     sampling = sampling_at(0.0, trainer.recipe, trainer.needs)
-    asked = trainer._eikonal(500, sampling, torch.Generator().manual_seed(0))
+    asked = eikonal(trainer.field, sampling, trainer.recipe, 0.0, torch.Generator().manual_seed(0))
     grid = trainer.field.surface.grid
     assert grid.extent == (2.0 if background == "on" else 1.0)
     assert asked.points.shape == (32, 3) and asked.noise.shape == (96, 3)
