@@ -23,9 +23,9 @@ from mmsynth.errors import known_error
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_json
 from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
-from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.work_partition import local_device
 from mmsynth.prior.prior import load_prior

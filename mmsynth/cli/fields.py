@@ -92,7 +92,7 @@ def fit(
     """Learn the field of a scene."""
     from mmsynth.fitting.choices import Choice, choices_of, summary
     from mmsynth.fitting.device import pick_device
-    from mmsynth.fitting.trainer import FitProgress
+    from mmsynth.fitting.progress import FitProgress
     from mmsynth.report.text import fit_text
     from mmsynth.scene.exposure import read_exposure
     from mmsynth.scene.load import load_scene

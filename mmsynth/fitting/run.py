@@ -25,11 +25,12 @@ from mmsynth.files import remove_leftovers, write_text
 from mmsynth.fitting.checkpoint import CHECKPOINT_FOLDER, read_checkpoint, write_checkpoint
 from mmsynth.fitting.choices import switch
 from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.signals import delayed_signals
 from mmsynth.fitting.stored_frames import OnLoad
-from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.prior.prediction import common, predict, scene_facts
 from mmsynth.prior.prior import Prior
 from mmsynth.scene.exposure import Exposure, stated_exposure

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, 
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
+from mmsynth.fitting.progress import FitProgress, FitState
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
@@ -46,36 +47,6 @@ _MOST_RAYS = 65536
 _OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (measured on one scene)
 _RENEW_EVERY = 16  # steps: where rays go
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
-
-
-@dataclass(frozen=True)
-class FitProgress:
-    """One line of news: ``done`` in [0, 1], running means of loss and PSNR [dB] per modality, speeds over the fit."""
-
-    step: int
-    done: float
-    elapsed: float
-    loss: float
-    psnr: dict[str, float]
-    rays_per_s: float
-    samples_per_s: float
-
-
-@dataclass
-class _State:
-    step: int = 0
-    elapsed: float = 0.0
-    rays: int = 0
-    rays_total: int = 0
-    samples_total: int = 0
-    bad_steps: int = 0
-    reopened: int = 0
-    tables: TableSizes | None = None
-    light_looks: int = 0
-    light: Choice[bool] | None = None
-    decided: Decisions | None = None
-    mean_loss: float = math.nan
-    mean_error: dict[str, float] = field(default_factory=dict)
 
 
 class Trainer:
@@ -114,7 +85,7 @@ class Trainer:
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.no_light = Light(self.field.appearance.width, self.field.shader.heads.out_features).to(self.device)
-        self.state = _State(rays=recipe.sampling.initial_rays)
+        self.state = FitState(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
         self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
@@ -400,7 +371,7 @@ class Trainer:
                 raise InputError(
                     f"checkpoint: was made with {key} {theirs.get(key)}, this fit has {value}; give another --run or the same options."
                 )
-        self.state = TypeAdapter(_State).validate_python(saved["state"])
+        self.state = TypeAdapter(FitState).validate_python(saved["state"])
         if self.state.tables is not None:
             self._resize_tables(self.state.tables, torch.Generator())  # what is new is read from the checkpoint
         if self.state.light is not None:

@@ -9,10 +9,10 @@ from typing import Any
 
 from mmsynth.field.field import Field
 from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import CHECKPOINT_EVERY, fit
 from mmsynth.fitting.stored_frames import OnLoad
-from mmsynth.fitting.trainer import FitProgress
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output.progress import Progress
 from mmsynth.prior.prior import Prior

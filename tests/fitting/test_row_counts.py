@@ -13,11 +13,12 @@ from mmsynth.field.design import Design
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.table_sizes import cells_at_surface, rows_log2, size_tables
-from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region, Scene, Sensor

@@ -24,11 +24,12 @@ from mmsynth.fitting import run as run_module
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.device import pick_device
 from mmsynth.fitting.measurements import draw, load_measurements
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
 from mmsynth.fitting.terms import eikonal
-from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.packaged import data_folder
 from mmsynth.scene.images import load_frame

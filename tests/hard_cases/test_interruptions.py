@@ -18,8 +18,9 @@ from mmsynth.errors import InputError, Interrupted, OutOfMemoryError
 from mmsynth.field.kernels import cpu
 from mmsynth.field.kernels.cpu.compiled import KERNELS
 from mmsynth.fitting.checkpoint import read_checkpoint
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.run import fit
-from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 

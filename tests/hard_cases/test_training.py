@@ -16,10 +16,11 @@ from mmsynth.errors import DivergedError
 from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, odds, reference
 from mmsynth.field.rendering import ball_interval
 from mmsynth.fitting.measurements import draw
+from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
-from mmsynth.fitting.trainer import FitProgress, Trainer
+from mmsynth.fitting.trainer import Trainer
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map

@@ -17,8 +17,8 @@ def test_it_draws_what_its_definition_says(
     device: str, seed: int, key: tuple[int, int], rays: tuple[int, int, int], share: float | None
 ) -> None:
     tables, (selection, _) = test_drawing._scene(), test_drawing._selection(seed, share)
-    residual = torch.from_numpy(np.random.default_rng(seed).random(len(selection.count), np.float32))
-    ends, weight = reference.odds(residual, selection.count, tables[2].first_tile, 0.5)
+    residual = torch.from_numpy(np.random.default_rng(seed).random(len(selection.pixels), np.float32))
+    ends, weight = reference.odds(residual, selection.pixels, tables[2].first_tile, 0.5)
     selection = selection._replace(ends=ends, weight=weight)
     here = lambda parts: type(parts)(*(x.to(device) for x in parts))
     ours = cuda.draw(*map(here, tables), here(selection), list(rays), key)

@@ -29,9 +29,10 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
     sampling = sampling_at(0.1, trainer.recipe, trainer.needs)
     stage = step.stage(sampling, 20, decided=True, gains=True, early=True, outside=4)
     before, table = step.flat.values.clone(), field.surface.grid.table.detach().clone()
-    step.run(stage, sampling, 0, 1.0, 0.5)
+    for number in (0, 1):  # the last layer of the surface begins with zeros: the hidden one moves with the second step
+        step.run(stage, sampling, number, 1.0, 0.5)
     news = step.news(wait=True)
-    assert news is not None and (news.steps, news.bad) == (1, 0) and news.samples > sum(stage.rays) and 0.0 < news.loss < 10.0
+    assert news is not None and (news.steps, news.bad) == (2, 0) and news.samples > 2 * sum(stage.rays) and 0.0 < news.loss < 10.0
     assert list(news.errors) == list(step.order) and all(error > 0.0 for error in news.errors.values())
     moved = step.flat.values != before
     for name, p in field.named_parameters():
@@ -40,14 +41,14 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
             assert p.data_ptr() == step.flat.values[begin:].data_ptr(), name
             assert bool(moved[begin : begin + p.numel()].any()), name
     assert (field.surface.grid.table != table).any() and not step.flat.gradient.any() and not field.surface.grid.table.grad.any()
-    assert 0 < int((trainer.importance.residuals != 1.0).sum()) <= sum(stage.rays)
+    assert 0 < int((trainer.importance.residuals != 1.0).sum()) <= 2 * sum(stage.rays)
     with torch.no_grad():
         field.shader.heads.bias.fill_(torch.nan)
     before, table = step.flat.values.clone(), field.surface.grid.table.detach().clone()
-    step.run(stage, sampling, 1, 1.0, 0.5)
+    step.run(stage, sampling, 2, 1.0, 0.5)
     news = step.news(wait=True)
     assert news is not None and (news.steps, news.bad) == (1, 1)
     torch.testing.assert_close(step.flat.values, before, rtol=0, atol=0, equal_nan=True)
     assert torch.equal(field.surface.grid.table, table) and not step.flat.gradient.any()
     step.sync()
-    assert trainer.optimiser.count == 1
+    assert trainer.optimiser.count == 2
