@@ -155,7 +155,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
                 i = todo[a]
                 o = begin + i
                 t = where[i]
-                if t >= rays.far[o]:
+                if not t < rays.far[o]:  # NaN, too: where two samples fell into one place the step between them is not known
                     if waiting < count:
                         todo[left] = waiting
                         left += 1
