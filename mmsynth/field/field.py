@@ -121,6 +121,11 @@ class Field(nn.Module):
             "appearance.table": self.appearance.resize(first[1], radiance, generator),
         }
 
+    def rows_met(self, sampling: Sampling) -> dict[str, int]:
+        """How many of the first rows of each hash table are of levels in use."""
+        surface, radiance = self.surface.grid.offsets[sampling.active_surface], self.appearance.offsets[sampling.active_radiance]
+        return {"surface.grid.table": int(surface), "appearance.table": int(radiance)}
+
     def to_normalised(self, points: np.ndarray) -> Tensor:
         """World points (..., 3) → normalised frame, float32 on the field's device."""
         unit = (np.asarray(points, dtype=np.float64) - np.array(self.region.centre)) / self.region.radius

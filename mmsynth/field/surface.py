@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
-from mmsynth.field.kernels.learning import TAPS
+from mmsynth.field.kernels.learning import surface_gradient
 
 
 class Surface(nn.Module):
@@ -39,7 +39,4 @@ class Surface(nn.Module):
 
     def gradient(self, positions: Tensor, epsilon: float, active: int) -> Tensor:
         """∇sdf by four-tap differences of size ``epsilon`` (Neuralangelo, Li et al. 2023): (N, 3) → (N, 3)."""
-        taps = positions.new_tensor(TAPS)
-        shifted = positions[:, None] + taps * (epsilon / 3**0.5)
-        values = self(shifted.reshape(-1, 3), active).reshape(-1, 4)
-        return (values @ taps) * (3**0.5 / (4 * epsilon))
+        return surface_gradient(positions, epsilon, *self.at(active), kernels.surface_value)

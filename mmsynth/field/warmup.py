@@ -12,7 +12,6 @@ import torch
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import cpu
-from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.rendering import trace
@@ -50,13 +49,13 @@ def run_kernels() -> None:
         loss = loss + kernels.mirror(lamps, mirrors, hits.behind, measured).sum()
         (loss + surface(origins.detach(), 1).sum()).backward()
         none = torch.empty(0)
-        light = Light(4, 1)
         rays_of_step = kernels.Rays(origins.detach(), directions, one, 3.0 * one, one - 1.0)
-        kernels.learn(
-            *surface.at(1), appearance.at(1), Occupancy(4).states, weights, light.network(), none, rays_of_step,
+        step = kernels.Step(
+            *surface.at(1), appearance.at(1), Occupancy(4).states, weights, kernels.no_light("cpu"), none, rays_of_step,
             kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none, none, 0.05),
             kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
         )  # fmt: skip
+        kernels.learn(step)
     with torch.no_grad():
         kernels.shade(weights, hits.features, directions, 0)
     _draw()

@@ -22,6 +22,7 @@ from mmsynth.field import kernels, rendering
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.kernels.cuda import drawing, optimiser, stepping
 from mmsynth.field.kernels.cuda.learning import learn_all
+from mmsynth.field.kernels.learning import gradient_of
 from mmsynth.fitting import importance
 from mmsynth.fitting.graphs import Repeated
 from mmsynth.fitting.importance import Importance
@@ -29,6 +30,8 @@ from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.optimiser import BETAS, EPSILON, Adam
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.schedule import blocked_weight, shallow_factor
+from mmsynth.fitting.terms import eikonal_points
 
 SAMPLES = 1 << 18  # of a step, at the least: with fewer a GPU idles between kernels
 MOST_RAYS = 1 << 18
@@ -78,12 +81,6 @@ class _Flat(NamedTuple):
     second: Tensor
     rates: Tensor
     kinds: Tensor
-
-
-def _gradient(parameter: Tensor) -> Tensor:
-    if parameter.grad is None:
-        parameter.grad = torch.zeros_like(parameter)
-    return parameter.grad
 
 
 def bucket(rays: float) -> int:
@@ -216,22 +213,20 @@ class DeviceStep:
         sizes = [(b[0][-1], b[1][-1], b[2][-1], max(counts)) for b, counts in zip(begins, (stage.rays, stage.outside), strict=True)]
         rays, outside = sizes[0][0], sizes[1][0]
         has_opacity = any(x.has_opacity for x in m.values())
-        solid = 0.0 if stage.early else loss.blocked_weight
+        solid = blocked_weight(stage.early, self.recipe)
         known = stepping.Known(
             loss.alpha_weight / rays, loss.alpha_weight / max(outside, 1), loss.background_opacity_weight / rays,
             solid / rays, solid / max(outside, 1), math.exp(-sampling.max_optical_depth),
             has_opacity or self.needs.black_background, self.needs.black_background and not has_opacity,
         )  # fmt: skip
         bounds, contracted = (rendering.NEAR, rendering.FREE, rendering.FARTHEST), grid.extent > 1.0
-        points = loss.eikonal_points if loss.eikonal_weight > 0 else 0
-        free = points // 4
-        asked = 0 if stage.lamps else points - free
+        free, asked = eikonal_points(self.recipe, len(stage.lamps) > 0)
         cell = grid.cell(stage.active[0])
-        shallow = loss.eikonal_shallow_early if stage.early else 1.0
+        shallow = shallow_factor(stage.early, self.recipe)
         surface, appearance = field.surface.at(stage.active[0]), field.appearance.at(stage.active[1])
         none = torch.empty(0, device=device)
         shader = field.shader.weights()
-        network = kernels.LightNetwork(none, none, none, none, none, none, ints([], torch.int64))
+        network = kernels.no_light(device)
         if field.light is not None and stage.lamps:
             network = field.light.network()._replace(used=ints(stage.lamps, torch.int64))
         far_light = field.far_light if stage.far_light and field.far_light is not None else none
@@ -240,10 +235,7 @@ class DeviceStep:
         of_light = self.flat.gradient[light_begin : light_begin + sum(w.numel() for w in network[:6])]
         log_gain = self.log_gain if stage.gains else none
         now = sampling._replace(sharpness=numbers.sharpness, step=numbers.step)  # type: ignore[arg-type]
-        rows = {
-            "surface.grid.table": int(grid.offsets[stage.active[0]]),
-            "appearance.table": int(field.appearance.offsets[stage.active[1]]),
-        }
+        rows = field.rows_met(sampling)
         whole = lambda *shape: torch.empty(shape, device=device)
 
         def work() -> None:
@@ -260,17 +252,18 @@ class DeviceStep:
             aimed, view, opacities = stepping.aim(drawn, origins, directions, jitter, tables, known, bounds, contracted)
             at, noise = stepping.random_points(numbers, free, asked, grid.extent, 3.0)
             eikonal = kernels.Eikonal(at, noise, loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow)
-            learned = learn_all(
+            told = kernels.Step(
                 *surface, appearance, field.occupancy.states, shader, network, far_light, aimed, view, drawn.measured,
-                kernels.Gains(log_gain, drawn.frame), opacities, eikonal, now, of_shader, of_light,
+                kernels.Gains(log_gain, drawn.frame), opacities, eikonal, now,
             )  # fmt: skip
+            learned = learn_all(told, of_shader, of_light)
             f = self.flat
             optimiser.check(learned.loss, f.gradient, learned.samples, self.steps, self.told[:4])
             optimiser.guarded_adam(f.values, f.gradient, (f.first, f.second), f.rates, f.kinds, numbers.factors, self.steps, BETAS, EPSILON)
             for name, kind in _TABLES.items():
                 p, moments = self.adam.parameters[name], self.adam.moments[name]
                 optimiser.guarded_adam(
-                    p[: rows[name]], _gradient(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, numbers.factors,
+                    p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, numbers.factors,
                     self.steps, BETAS, EPSILON, sparse=True,
                 )  # fmt: skip
             stepping.tally(drawn, learned.squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)

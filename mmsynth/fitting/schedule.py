@@ -49,9 +49,19 @@ def learning_rate_factor(progress: float, recipe: Recipe) -> float:
     return max(rise, 0.02) * math.exp(math.log(recipe.schedule.learning_rate_end_factor) * fall)
 
 
-def blocked_weight(progress: float, recipe: Recipe) -> float:
+def is_early(progress: float, recipe: Recipe) -> bool:
+    """Whether levels are still to open."""
+    return progress < recipe.schedule.levels_until
+
+
+def blocked_weight(early: bool, recipe: Recipe) -> float:
     """None until all levels are active: till then soft surfaces block rays that pass by, and what is pulled away there is the object."""
-    return 0.0 if progress < recipe.schedule.levels_until else recipe.loss.blocked_weight
+    return 0.0 if early else recipe.loss.blocked_weight
+
+
+def shallow_factor(early: bool, recipe: Recipe) -> float:
+    """Of slopes below 1, in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together."""
+    return recipe.loss.eikonal_shallow_early if early else 1.0
 
 
 _LOOKS = 3  # before it is decided whether lamps are needed

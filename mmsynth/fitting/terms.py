@@ -8,11 +8,10 @@ import torch
 
 from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
+from mmsynth.field.kernels.constants import BLACK
 from mmsynth.fitting.measurements import Batch
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.schedule import blocked_weight
-
-_BLACK = 0.02  # of a modality's typical value
+from mmsynth.fitting.schedule import blocked_weight, is_early, shallow_factor
 
 
 def opacities(batch: Batch, outside: int, has_opacity: bool, black_background: bool, recipe: Recipe, progress: float) -> kernels.Opacities:
@@ -26,7 +25,7 @@ def opacities(batch: Batch, outside: int, has_opacity: bool, black_background: b
         return kernels.Opacities(none(0), none(0), none(0), none(0), 0.0)
     target, weight, linear, blocked = (none(rays + outside) for _ in range(4))
     weight[rays:] = loss.alpha_weight / max(outside, 1)
-    solid = blocked_weight(progress, recipe)
+    solid = blocked_weight(is_early(progress, recipe), recipe)
     blocked[rays:] = solid / max(outside, 1)
     if has_opacity:
         known = torch.isfinite(batch.alpha)
@@ -35,20 +34,24 @@ def opacities(batch: Batch, outside: int, has_opacity: bool, black_background: b
         blocked[:rays] = solid / rays * batch.ray_weight * (batch.alpha == 0.0)
     else:
         m = batch.measured
-        black = none(rays).scatter_reduce(0, m.ray, m.target / m.level, "amax") < _BLACK
+        black = none(rays).scatter_reduce(0, m.ray, m.target / m.level, "amax") < BLACK
         linear[:rays] = loss.background_opacity_weight / rays * batch.ray_weight * black
     return kernels.Opacities(target, weight, linear, blocked, math.exp(-recipe.sampling.max_optical_depth))
+
+
+def eikonal_points(recipe: Recipe, shines: bool) -> tuple[int, int]:
+    """How many points a step asks in all space, and how many near what rays meet, which is asked everywhere if it shines."""
+    count = recipe.loss.eikonal_points if recipe.loss.eikonal_weight > 0 else 0
+    return count // 4, 0 if shines else count - count // 4
 
 
 def eikonal(field: Field, sampling: kernels.Sampling, recipe: Recipe, progress: float, generator: torch.Generator) -> kernels.Eikonal:
     """Where the distance is pulled towards a true one: a quarter of the points in all space, the others within the soft surface, or at
     all surfaces that rays meet where these shine, whose normals are known."""
     grid = field.surface.grid
-    count = recipe.loss.eikonal_points if recipe.loss.eikonal_weight > 0 else 0
-    points = (torch.rand(count // 4, 3, generator=generator) * 2 - 1) * grid.extent
-    near = 0 if field.shines else count - len(points)
+    free, near = eikonal_points(recipe, field.shines)
+    points = (torch.rand(free, 3, generator=generator) * 2 - 1) * grid.extent
     noise = torch.randn(near, 3, generator=generator) * (3.0 / sampling.sharpness)
     cell = grid.cell(sampling.active_surface)
-    # in the region alone: behind it are no gaps that the grid could resolve, and much that the pull holds together
-    shallow = recipe.loss.eikonal_shallow_early if progress < recipe.schedule.levels_until else 1.0
+    shallow = shallow_factor(is_early(progress, recipe), recipe)
     return kernels.Eikonal(points.to(field.device), noise.to(field.device), recipe.loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow)

@@ -19,7 +19,6 @@ from torch.nn.functional import pad
 from mmsynth.errors import DivergedError, InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
-from mmsynth.field.light import Light
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.importance import Importance
@@ -31,7 +30,7 @@ from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.progress import FitProgress, FitState
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, sampling_at, surface_rate_factor
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, opacities
@@ -84,7 +83,6 @@ class Trainer:
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
-        self.no_light = Light(self.field.appearance.width, self.field.shader.heads.out_features).to(self.device)
         self.state = FitState(rays=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
@@ -165,7 +163,7 @@ class Trainer:
         if prepared != self.prepared:
             step.renew()
             self.prepared = prepared
-        early = done < self.recipe.schedule.levels_until
+        early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
         step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
         self._average()
@@ -250,9 +248,7 @@ class Trainer:
         """A step of the optimiser, and of the mean over the last parameters."""
         field, done = self.field, self.progress
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
-        surface_rows = int(field.surface.grid.offsets[sampling.active_surface])
-        rows = {"surface.grid.table": surface_rows, "appearance.table": int(field.appearance.offsets[sampling.active_radiance])}
-        self.optimiser.step(learning_rate_factor(done, self.recipe), slower, rows)
+        self.optimiser.step(learning_rate_factor(done, self.recipe), slower, field.rows_met(sampling))
         self._average()
 
     def _average(self) -> None:
@@ -275,16 +271,17 @@ class Trainer:
         trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
         outside = count - len(trains)
         view = kernels.View(*(pad(x, (0, outside), value=y) for x, y in ((batch.per_ray(field.view_dependence), 0), (trains, True))))
-        light = field.light if field.light is not None and field.shines else self.no_light
+        light = field.light.network() if field.light is not None and field.shines else kernels.no_light(self.device)
         # light from beyond the region would explain what is in it as long as that has no shape
         far_light = field.far_light if field.far_light is not None and self.state.decided is not None else origins.new_empty(0)
         log_gain = self.log_gain if self._has_gains else origins.new_empty(0)
-        return kernels.learn(
+        step = kernels.Step(
             *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
-            field.shader.weights(), light.network(), far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
+            field.shader.weights(), light, far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
             eikonal(field, sampling, self.recipe, self.progress, generator), sampling,
         )  # fmt: skip
+        return kernels.learn(step)
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""

@@ -83,11 +83,12 @@ def _run(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Learned, dic
     tuples = {n: type(x)(*map(cast, x)) for n, x in step.items() if isinstance(x, tuple)}
     far_light, log_gain = (nn.Parameter(x.detach().to(dtype)) for x in (step["far_light"], step["gains"].log_gain))
     grid, network = modules["surface"].at(3)
-    found = (kernels.learn if dtype == torch.float32 else learn)(
+    told = kernels.Step(
         grid, network, modules["appearance"].at(3), step["states"], modules["shader"].weights(), modules["light"].network(), far_light,
         tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
         tuples["eikonal"], step["sampling"],
     )  # fmt: skip
+    found = (kernels.learn if dtype == torch.float32 else learn)(told)
     parameters = {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
     return found, {n: p.grad.clone() for n, p in parameters.items() if p.grad is not None and p.numel()}
 

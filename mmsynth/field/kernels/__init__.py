@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mmsynth.field.kernels import cpu, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
+from mmsynth.field.kernels.learning import no_light
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
     AdamStep,
@@ -41,6 +42,7 @@ from mmsynth.field.kernels.parameters import (
     Selection,
     ShadedRays,
     ShaderWeights,
+    Step,
     SurfaceNetwork,
     View,
 )
@@ -73,6 +75,7 @@ __all__ = [
     "Selection",
     "ShadedRays",
     "ShaderWeights",
+    "Step",
     "SurfaceNetwork",
     "Surroundings",
     "View",
@@ -88,6 +91,7 @@ __all__ = [
     "learn",
     "march",
     "mirror",
+    "no_light",
     "odds",
     "photometric",
     "predict",
@@ -167,26 +171,9 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
 
 
-def learn(
-    grid: GridTable,
-    network: SurfaceNetwork,
-    appearance: GridTable,
-    states: Tensor,
-    shader: ShaderWeights,
-    light: LightNetwork,
-    far_light: Tensor,
-    rays: Rays,
-    view: View,
-    measured: Measured,
-    gains: Gains,
-    opacities: Opacities,
-    eikonal: Eikonal,
-    sampling: Sampling,
-) -> Learned:
+def learn(step: Step) -> Learned:
     """A step's loss, and its gradients, added to ``grad`` of what is learned."""
-    return _backend(rays.origins).learn(
-        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling
-    )
+    return _backend(step.rays.origins).learn(step)
 
 
 def draw(

@@ -18,6 +18,7 @@ ALONG_FACE = 1e-9
 LAYER_GAP = 7.3  # times 1 / sharpness, in the frame of the grid: sections farther apart are of two surfaces (no multiple of a usual step)
 
 HARMONICS = 16  # spherical harmonics up to degree 3
+BLACK = 0.02  # of its modality's level: pixels that are darker say that nothing is there, where a scene is on black
 MOSTLY_BLOCKED = 0.5  # opacity of a ray that does not only graze an edge
 HUBER_DELTA = 0.5  # relative residuals above it count linearly
 LEAST_ROUGHNESS = 0.02  # sharper images than any pixel could tell

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torch.nn.functional import linear, normalize
@@ -10,52 +12,45 @@ from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import LEAST_WEIGHT, MOSTLY_BLOCKED
 from mmsynth.field.kernels.parameters import (
     Eikonal,
-    Gains,
     GridTable,
     Hits,
     Lamps,
     Learned,
     LightNetwork,
-    Measured,
     Mirrors,
-    Opacities,
     Rays,
-    Sampling,
     ShadedRays,
-    ShaderWeights,
+    Step,
     SurfaceNetwork,
     View,
 )
 from mmsynth.field.kernels.shading import rays_of
 
+Evaluation = Callable[[Tensor, GridTable, SurfaceNetwork], Tensor]  # see ``reference.surface_value``
 # corners of a regular tetrahedron: the four taps of a first derivative, its trace exact for linear functions
 TAPS = ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, 1.0, 1.0))
 
 
-def learn(
-    grid: GridTable,
-    network: SurfaceNetwork,
-    appearance: GridTable,
-    states: Tensor,
-    shader: ShaderWeights,
-    light: LightNetwork,
-    far_light: Tensor,
-    rays: Rays,
-    view: View,
-    measured: Measured,
-    gains: Gains,
-    opacities: Opacities,
-    eikonal: Eikonal,
-    sampling: Sampling,
-) -> Learned:
+def gradient_of(tensor: Tensor) -> Tensor:
+    """Its ``grad``, zeros if it had none."""
+    if tensor.grad is None:
+        tensor.grad = torch.zeros_like(tensor)
+    return tensor.grad
+
+
+def no_light(device: torch.device | str) -> LightNetwork:
+    """Of a field in which nothing shines."""
+    empty = lambda *shape: torch.empty(shape, device=device)
+    none = torch.empty(0, dtype=torch.int64, device=device)
+    return LightNetwork(empty(0, 0), empty(0), empty(0, 0), empty(0), empty(0, 3), empty(0, 0), none)
+
+
+def learn(step: Step) -> Learned:
     """The loss of R rays, and its gradients, which are added to ``grad`` of all tables, weights, lamps and gains.
 
-    The photometric loss (see ``compare``), ``Opacities`` and ``Eikonal``.
-
-    Args:
-        states, sampling: see ``trace``. far_light: (F,), features of the light that passes everything, empty: it is black.
-        rays: their places have no gradient. Those from some number on may have no measurements.
+    It is the photometric loss (see ``compare``), ``Opacities`` and ``Eikonal``.
     """
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
     count = len(rays.origins)
     hits = reference.trace(grid, network, appearance, states, rays, sampling)
     ray = rays_of(hits.behind, len(hits.share))
@@ -93,11 +88,13 @@ def with_far_light(hits: Hits, far_light: Tensor) -> Hits:
     return hits._replace(features=torch.lerp(hits.features, far_light.expand_as(hits.features), mixed), share=share)
 
 
-def surface_gradient(positions: Tensor, epsilon: float, grid: GridTable, network: SurfaceNetwork) -> Tensor:
+def surface_gradient(
+    positions: Tensor, epsilon: float, grid: GridTable, network: SurfaceNetwork, surface_value: Evaluation = reference.surface_value
+) -> Tensor:
     """∇sdf by four-tap differences of size ``epsilon`` (Neuralangelo, Li et al. 2023): (N, 3) in the frame of the grid → (N, 3)."""
     taps = positions.new_tensor(TAPS)
     shifted = positions[:, None] + taps * (epsilon / 3**0.5)
-    values = reference.surface_value(shifted.reshape(-1, 3), grid, network).reshape(-1, 4)
+    values = surface_value(shifted.reshape(-1, 3), grid, network).reshape(-1, 4)
     return (values @ taps) * (3**0.5 / (4 * epsilon))
 
 

@@ -242,6 +242,30 @@ class Eikonal(NamedTuple):
     shallow: float
 
 
+class Step(NamedTuple):
+    """What a step of a fit is told, see ``learning.learn``.
+
+    Attributes:
+        grid, network, appearance, states, sampling: see ``reference.trace``. far_light: (F,), features of the light that passes
+            everything, empty: it is black. rays: their places have no gradient; those from some number on may have no measurements.
+    """
+
+    grid: GridTable
+    network: SurfaceNetwork
+    appearance: GridTable
+    states: Tensor
+    shader: ShaderWeights
+    light: LightNetwork
+    far_light: Tensor
+    rays: Rays
+    view: View
+    measured: Measured
+    gains: Gains
+    opacities: Opacities
+    eikonal: Eikonal
+    sampling: Sampling
+
+
 class Learned(NamedTuple):
     """Of a step: the loss, a scalar; squared (M,), residuals; samples, a number."""
 

@@ -9,7 +9,7 @@ instructions.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -17,7 +17,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, HASH_PRIMES
-from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, element, splat, whole
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, element, padded, splat, whole
 
 _P1 = np.uint32(HASH_PRIMES[1])
 _P2 = np.uint32(HASH_PRIMES[2])
@@ -150,13 +150,13 @@ class SurfaceLayers(NamedTuple):
     outer_radius: np.float32
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def padded_output(output, units):  # type: ignore[no-untyped-def]
-    """Weights (H + 1,) of the last layer, bias last, of so many units as there are in whole tiles."""
-    out = np.zeros(units + 1, np.float32)
-    out[: len(output) - 1] = output[:-1]
-    out[units] = output[-1]
-    return out
+def surface_layers(network: Any) -> SurfaceLayers:
+    """Of a ``SurfaceNetwork`` of arrays."""
+    units, inputs = network.hidden.shape
+    hidden = padded(network.hidden, columns=FIRST_FEATURE_ROW + whole.py_func(inputs - FIRST_FEATURE_ROW, TILE_COLS))
+    output = np.zeros(len(hidden) + 1, np.float32)
+    output[:units], output[-1] = network.output[:units], network.output[units]
+    return SurfaceLayers(hidden, np.ascontiguousarray(hidden.T), output, network.inner_radius, network.outer_radius)
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")

@@ -14,11 +14,10 @@ from numba import njit, prange
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
-from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, padded_output, scatter_block
+from mmsynth.field.kernels.cpu.blocks import scatter_block
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
-from mmsynth.field.kernels.cpu.matrices import padded, padded_to
-from mmsynth.field.kernels.cpu.mirrors import LightLayers, mirrors_backward, mix, mix_backward, see_mirrors
-from mmsynth.field.kernels.cpu.shading import Layers, clear_gradients, compare_rays, first_at
+from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backward, see_mirrors
+from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
 from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
 from mmsynth.field.kernels.cpu.tasks import take
 from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
@@ -95,10 +94,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
                 g_features, g_share, g_gain, g_mirrored,
             )  # fmt: skip
         if len(far_light):
-            mix_backward(
-                some, far_light, rows[sub:], share[sub:], opacity[sub:], _shifted(behind, sub, some), s.mixed_share[slot][sub:],
-                g_features[sub:], g_share[sub:], out.far[chunk],
-            )  # fmt: skip
+            mix_backward(sub, sub + some, far_light, rows, share, opacity, behind, s.mixed_share[slot], g_features, g_share, out.far[chunk])
         if shines:
             loss += mirrors_backward(
                 sub, some, n, first, begin, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor,
@@ -152,19 +148,9 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shifted(behind, sub, some):  # type: ignore[no-untyped-def]
-    """Rows from the ``sub``-th on."""
-    out = np.empty(some, np.int64)
-    for i in range(some):
-        out[i] = behind[sub + i] - sub if behind[sub + i] >= 0 else -1
-    return out
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _work(  # type: ignore[no-untyped-def]
     worker, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
-    measured,
-    gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """Take chunks of rays, and then points, until there are none."""
     total, points = rays.origins.shape[0], eikonal.points.shape[0]
@@ -177,8 +163,7 @@ def _work(  # type: ignore[no-untyped-def]
             out.loss[chunk] = _learn_rays(
                 chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, surface, appearance, layers,
                 heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded,
-                scratch, out,
-                samples, squared, mirrored, g_mirrored, g_gain,
+                scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
             )  # fmt: skip
             continue
         begin = (chunk - chunks) * POINTS
@@ -192,34 +177,20 @@ def _work(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def learn_rays(  # type: ignore[no-untyped-def]
-    threads, next_task, rays, states, sampling, grid, network, appearance, shader, light, lamps, far_light, view, measured, gain,
-    opacities, eikonal,
-    store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    threads, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
+    measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """See ``learning.learn``: all but the gradients of the tables, which ``learn_tables`` adds up.
 
-    light: its network with the columns of the lamps that there are. lamps: those. gain, mirrored: (M,), empty where there are none.
+    surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
+    there are. lamps: those. gain, mirrored: (M,), empty where there are none.
     """
-    layers = Layers(
-        padded(shader.first), padded(shader.first.T), shader.first_bias,
-        padded(shader.second), padded(shader.second.T), shader.second_bias,
-    )  # fmt: skip
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    surface = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
-    network_of_light = LightLayers(
-        padded(light.first), padded(light.first.T), light.first_bias,
-        padded(light.second), padded(light.second.T), light.second_bias,
-    )  # fmt: skip
     next_task[0] = 0
     for worker in prange(threads):
         _work(
-            np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, shader.heads, shader.heads_bias,
-            network_of_light, lamps, far_light, view, measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out,
-            samples, squared,
-            mirrored, g_mirrored, g_gain,
+            np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps,
+            far_light, view, measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
+            g_mirrored, g_gain,
         )  # fmt: skip
 
 

@@ -30,9 +30,8 @@ from mmsynth.field.kernels.constants import (
     SOFT_SURFACE,
     SOLID,
 )
-from mmsynth.field.kernels.cpu.blocks import SurfaceLayers, encode_block, padded_output, surface_block
+from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
-from mmsynth.field.kernels.cpu.matrices import padded_to
 
 CHUNK = 128  # rays
 LANES = 64
@@ -307,14 +306,9 @@ def composite(begin, count, slot, sections, appearance, store, features, distanc
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def trace_forward(rays, states, sampling, grid, network, appearance, keep, store, out):  # type: ignore[no-untyped-def]
+def trace_forward(rays, states, sampling, grid, layers, appearance, keep, store, out):  # type: ignore[no-untyped-def]
     """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
     total, samples = rays.origins.shape[0], out.samples  # in a parallel loop, numba would not set a tuple's arrays
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    layers = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         slot = np.int64(chunk) if keep else np.int64(get_thread_id())
         begin = np.int64(chunk) * CHUNK

@@ -113,17 +113,9 @@ def whole(count, of):  # type: ignore[no-untyped-def]
     return (count + of - 1) // of * of
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def padded(matrix):  # type: ignore[no-untyped-def]
-    """A copy of whole tiles, whichever way round it is used."""
-    return padded_to(matrix, whole(matrix.shape[0], TILE_COLS), whole(matrix.shape[1], TILE_COLS))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def padded_to(matrix, rows, columns):  # type: ignore[no-untyped-def]
-    """A copy with so many rows and columns, the new ones full of zeros."""
-    out = np.zeros((rows, columns), np.float32)
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
-            out[i, j] = matrix[i, j]
+def padded(matrix: np.ndarray, columns: int | None = None) -> np.ndarray:
+    """A copy of whole tiles, whichever way round it is used, or of so many columns."""
+    rows, width = matrix.shape
+    out = np.zeros((whole.py_func(rows, TILE_COLS), whole.py_func(width, TILE_COLS) if columns is None else columns), np.float32)
+    out[:rows, :width] = matrix
     return out

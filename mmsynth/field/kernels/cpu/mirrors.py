@@ -40,7 +40,6 @@ class ChunkScratch(NamedTuple):
     normals: np.ndarray  # (2 CHUNK, 3)
     points: np.ndarray
     directions: np.ndarray
-    slopes: np.ndarray
     g_material: np.ndarray
     g_normals: np.ndarray
     mirror_share: np.ndarray
@@ -69,17 +68,6 @@ class LightOut(NamedTuple):
     loss: np.ndarray
 
 
-class LightLayers(NamedTuple):
-    """The light's network, padded to whole tiles, (units, inputs) and turned to (inputs, units)."""
-
-    first: np.ndarray
-    first_turned: np.ndarray
-    first_bias: np.ndarray
-    second: np.ndarray
-    second_turned: np.ndarray
-    second_bias: np.ndarray
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def mix(count, far_light, features, share, opacity, behind, mixed, mixed_share):  # type: ignore[no-untyped-def]
     """See ``learning.with_far_light``."""
@@ -98,10 +86,10 @@ def mix(count, far_light, features, share, opacity, behind, mixed, mixed_share):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mix_backward(count, far_light, features, share, opacity, behind, mixed_share, g_features, g_share, g_far):  # type: ignore[no-untyped-def]
-    """Gradients of what is shaded, g_features and g_share, become those of what was met."""
+def mix_backward(begin, end, far_light, features, share, opacity, behind, mixed_share, g_features, g_share, g_far):  # type: ignore[no-untyped-def]
+    """Gradients of what is shaded, g_features and g_share, become those of what was met, of some of the rays."""
     width = features.shape[1]
-    for i in range(count):
+    for i in range(begin, end):
         row = behind[i] if behind[i] >= 0 else i
         passed = _ONE - opacity[i]
         total = mixed_share[row]

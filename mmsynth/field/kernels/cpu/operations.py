@@ -17,8 +17,11 @@ from torch import Tensor
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.blocks import surface_layers
 from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
+from mmsynth.field.kernels.cpu.matrices import padded
+from mmsynth.field.kernels.cpu.shading import Layers, two_layers
 from mmsynth.field.kernels.cpu.slopes import TapStore
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
@@ -32,23 +35,20 @@ from mmsynth.field.kernels.cpu.stores import (
     tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
+from mmsynth.field.kernels.learning import gradient_of
 from mmsynth.field.kernels.parameters import (
-    Eikonal,
-    Gains,
     GridTable,
     Hits,
     Lamps,
     Learned,
-    LightNetwork,
     Measured,
     Mirrors,
-    Opacities,
     Rays,
     Sampling,
     ShadedRays,
     ShaderWeights,
+    Step,
     SurfaceNetwork,
-    View,
 )
 
 P = TypeVar("P", bound=tuple[Any, ...])
@@ -86,10 +86,9 @@ def _in_double(sampling: Sampling) -> Sampling:
     return Sampling(**values)
 
 
-def _table_gradient(table: Tensor) -> np.ndarray:
-    if table.grad is None:
-        table.grad = torch.zeros_like(table)
-    return table.grad.numpy()
+def _shader_layers(weights: Any) -> tuple[Layers, np.ndarray, np.ndarray]:
+    """Hidden layers, heads and their biases of ``ShaderWeights`` of arrays."""
+    return two_layers(*weights[:4]), weights.heads, weights.heads_bias
 
 
 def _kept(*tensors: Tensor) -> bool:
@@ -123,7 +122,7 @@ class _Value(torch.autograd.Function):
     ) -> Tensor:
         store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), len(hidden), len(grid.resolutions))
         out = torch.empty(len(positions))
-        surface.surface_forward(_array(positions), _arrays(grid), _arrays(network), keep, store.arrays, out.numpy())
+        surface.surface_forward(_array(positions), _arrays(grid), surface_layers(_arrays(network)), keep, store.arrays, out.numpy())
         if keep:
             ctx.store, ctx.parameters = store, (grid, network)
             ctx.save_for_backward(hidden, output)
@@ -134,14 +133,14 @@ class _Value(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         hidden, output = ctx.saved_tensors
         (grid, network), arrays, count = ctx.parameters, ctx.store.arrays, len(gradient)
-        g, table, weights = _array(gradient), _arrays(grid), _arrays(network._replace(hidden=hidden, output=output))
+        g, table, weights = _array(gradient), _arrays(grid), surface_layers(_arrays(network._replace(hidden=hidden, output=output)))
         surface.surface_backward(g, grid.active, weights, arrays)
         positions = None
         if ctx.needs_input_grad[1]:
             positions = torch.empty(count, 3)
             surface.surface_positions(g, table, weights, arrays, positions.numpy())
         if grid.table.requires_grad:
-            surface.surface_scatter(count, table, arrays, _table_gradient(grid.table))
+            surface.surface_scatter(count, table, arrays, gradient_of(grid.table).numpy())
         ctx.store = None
         return None, positions, None, None, *_summed(arrays, -(-count // POINTS), hidden)
 
@@ -173,7 +172,8 @@ class _Trace(torch.autograd.Function):
         weight, distance, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
         marching.trace_forward(
-            _arrays(rays), _array(states), sampling, _arrays(grid), _arrays(network), _arrays(appearance), keep, store.arrays,
+            _arrays(rays), _array(states), sampling, _arrays(grid), surface_layers(_arrays(network)), _arrays(appearance), keep,
+            store.arrays,
             TraceOutputs(*(x.numpy() for x in (features, weight, distance, shown, depth, samples))),
         )  # fmt: skip
         behind = torch.full((count,), -1)
@@ -191,7 +191,8 @@ class _Trace(torch.autograd.Function):
     def backward(ctx: Any, g_features: Tensor, g_weight: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         hidden, output, origins, directions, features, shown, behind = ctx.saved_tensors
         (grid, network, appearance, sharpness), arrays, count = ctx.parameters, ctx.store.arrays, len(origins)
-        table, look, weights = _arrays(grid), _arrays(appearance), _arrays(network._replace(hidden=hidden, output=output))
+        table, look = _arrays(grid), _arrays(appearance)
+        weights = surface_layers(_arrays(network._replace(hidden=hidden, output=output)))
         tracing_gradients.trace_backward(
             *map(_array, (behind, g_features, g_weight, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
         )
@@ -203,7 +204,7 @@ class _Trace(torch.autograd.Function):
             )
             to_rays = list(found)
         if grid.table.requires_grad or appearance.table.requires_grad:
-            gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
+            gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
             tracing_gradients.trace_scatter(count, table, look, arrays, *gradients)
         ctx.store = None
         return None, *to_rays, *_summed(arrays, -(-count // CHUNK), hidden), None
@@ -241,8 +242,8 @@ class _Compare(torch.autograd.Function):
         loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
         gradients = [torch.empty(x.shape) for x in (features, share, gain, mirrored)]
         shading.compare(
-            _arrays(rays), _arrays(measured), _array(gain), _array(mirrored), _arrays(tensors), learn, arrays, loss, squared.numpy(),
-            *(g.numpy() for g in gradients),
+            _arrays(rays), _arrays(measured), _array(gain), _array(mirrored), *_shader_layers(_arrays(tensors)), learn, arrays, loss,
+            squared.numpy(), *(g.numpy() for g in gradients),
         )  # fmt: skip
         if learn:
             for name, weight in zip(ShaderWeights._fields, weights, strict=True):
@@ -264,7 +265,8 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     if isinstance(degrees, Tensor) or torch.is_grad_enabled():
         return reference.shade(weights, features, directions, degrees)
     outputs = torch.empty(len(features), len(weights.heads_bias))
-    shading.shade(_array(features), _array(directions), degrees, _arrays(weights), outputs.numpy())
+    layers, heads, biases = _shader_layers(_arrays(weights))
+    shading.shade(_array(features), _array(directions), degrees, layers, padded(heads.T), biases, outputs.numpy())
     return outputs
 
 
@@ -302,23 +304,9 @@ class _Mirror(torch.autograd.Function):
 
 
 @torch.no_grad()
-def learn(
-    grid: GridTable,
-    network: SurfaceNetwork,
-    appearance: GridTable,
-    states: Tensor,
-    shader: ShaderWeights,
-    light: LightNetwork,
-    far_light: Tensor,
-    rays: Rays,
-    view: View,
-    measured: Measured,
-    gains: Gains,
-    opacities: Opacities,
-    eikonal: Eikonal,
-    sampling: Sampling,
-) -> Learned:
+def learn(step: Step) -> Learned:
     """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), get_num_threads()
     tasks = chunks + -(-points // slopes.POINTS)
@@ -328,7 +316,7 @@ def learn(
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
     lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining = _arrays(light._replace(second=light.second[columns], second_bias=light.second_bias[columns]))
+    shining: Any = _arrays(light._replace(second=light.second[columns], second_bias=light.second_bias[columns]))
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
@@ -343,13 +331,12 @@ def learn(
     next_task = np.zeros(1, np.int64)
     table, look = _arrays(grid), _arrays(appearance)
     learning.learn_rays(
-        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, _arrays(network), look, _arrays(shader), shining,
-        lamps,
-        _array(far_light), _arrays(view), _arrays(measured), gain, _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays,
-        taps.arrays,
-        weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
+        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, surface_layers(_arrays(network)), look,
+        *_shader_layers(_arrays(shader)), two_layers(*shining[:4]), lamps, _array(far_light), _arrays(view), _arrays(measured), gain,
+        _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays, out.arrays, samples,
+        squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
-    gradients = _table_gradient(grid.table), _table_gradient(appearance.table)
+    gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
     learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
     for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
         for weight, gradient in zip((network.hidden, network.output), _of_weights(arrays, parts, network.hidden), strict=True):
@@ -376,9 +363,7 @@ def learn(
 
 def _add_gradient(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray | None = None) -> None:
     """To ``tensor.grad``, or some of its rows."""
-    if tensor.grad is None:
-        tensor.grad = torch.zeros_like(tensor)
-    grad = tensor.grad.numpy()
+    grad = gradient_of(tensor).numpy()
     if rows is None:
         grad += gradient
     else:

@@ -195,6 +195,11 @@ class Layers(NamedTuple):
     second_bias: np.ndarray
 
 
+def two_layers(first: np.ndarray, first_bias: np.ndarray, second: np.ndarray, second_bias: np.ndarray) -> Layers:
+    """Weights (units, inputs) and biases as the kernels take them."""
+    return Layers(padded(first), padded(first.T), first_bias, padded(second), padded(second.T), second_bias)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def clear_gradients(store, chunk):  # type: ignore[no-untyped-def]
     """Of weights, of one chunk."""
@@ -259,7 +264,7 @@ def compare_rays(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def compare(  # type: ignore[no-untyped-def]
-    rays, measured, gain, mirrored, weights, learn, store, loss, squared, g_features, g_share, g_gain, g_mirrored
+    rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, loss, squared, g_features, g_share, g_gain, g_mirrored
 ):
     """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` and ``mirrored`` may be empty; the loss and the
     gradients of weights are per chunk.
@@ -267,17 +272,13 @@ def compare(  # type: ignore[no-untyped-def]
     store: ``ShadingStore``, whose scratch has a slot per thread.
     """
     total = len(rays.behind)
-    layers = Layers(
-        padded(weights.first), padded(weights.first.T), weights.first_bias,
-        padded(weights.second), padded(weights.second.T), weights.second_bias,
-    )  # fmt: skip
     for task in prange((total + CHUNK - 1) // CHUNK):
         chunk, slot = np.int64(task), np.int64(get_thread_id())
         begin = chunk * CHUNK
         clear_gradients(store, chunk)
         loss[chunk] = compare_rays(
-            begin, min(CHUNK, total - begin), np.int64(0), slot, chunk, rays, measured, gain, mirrored, layers, weights.heads,
-            weights.heads_bias, learn, store, squared, g_features, g_share, g_gain, g_mirrored,
+            begin, min(CHUNK, total - begin), np.int64(0), slot, chunk, rays, measured, gain, mirrored, layers, heads, heads_bias,
+            learn, store, squared, g_features, g_share, g_gain, g_mirrored,
         )  # fmt: skip
 
 
@@ -303,14 +304,9 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def shade(features, directions, degree, weights, outputs):  # type: ignore[no-untyped-def]
+def shade(features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """See ``reference.shade``, of rays that all have one degree."""
     rays = len(features)
-    layers = Layers(
-        padded(weights.first), padded(weights.first.T), weights.first_bias,
-        padded(weights.second), padded(weights.second.T), weights.second_bias,
-    )  # fmt: skip
-    heads = padded(weights.heads.T)
     for task in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(task) * CHUNK
-        _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, heads, weights.heads_bias, outputs)
+        _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, heads, heads_bias, outputs)

@@ -11,7 +11,7 @@ from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
 from mmsynth.field.kernels.cpu import shading
 from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CAPACITY, CHUNK
-from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS
+from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, whole
 from mmsynth.field.kernels.cpu.mirrors import ChunkScratch, LightOut
 from mmsynth.field.kernels.cpu.slopes import MOST_TAPPED, TapStore
 from mmsynth.field.kernels.cpu.surface import POINTS
@@ -102,13 +102,13 @@ class Store(Generic[S]):
             _pool.append((self.key, self.arrays))
 
 
-def _whole(count: int) -> int:
-    return -(-count // TILE_COLS) * TILE_COLS
+def _tiles(count: int) -> int:
+    return whole.py_func(count, TILE_COLS)
 
 
 def _network(rows: int, units: int, levels: int) -> Sizes:
     """Rows of blocks of so many levels, hidden units, and the weights' gradients."""
-    f, width, units = np.float32, FIRST_FEATURE_ROW + _whole(FEATURES * levels), _whole(units)
+    f, width, units = np.float32, FIRST_FEATURE_ROW + _tiles(FEATURES * levels), _tiles(units)
     return {"block": (f, (rows, width)), "hidden": (f, (rows, units)), "turned_out": (f, (width, units)), "output_out": (f, (units + 1,))}
 
 
@@ -133,7 +133,7 @@ def ray_store(slots: int, units: int, levels: int, appearance_levels: int) -> St
 
 def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
     """Matrices have whole tiles."""
-    rows, columns = map(_whole, weights.first.shape)
+    rows, columns = map(_tiles, weights.first.shape)
     most = 2 * shading.CHUNK  # surfaces, of which a ray meets two at the most
     block, heads = (most, rows), weights.heads.shape
     shapes = {
@@ -161,30 +161,29 @@ def table_store(slots: int, units: int, levels: int, appearance_levels: int) -> 
 
 def chunk_scratch(slots: int, units: int, features: int, materials: int, hidden: int) -> Store[ChunkScratch]:
     """Of a surface of so many hidden units, rays with so many features, numbers of a material and hidden units of its network."""
-    f, whole = np.float32, _whole
+    f = np.float32
     rows, columns = 2 * CHUNK, (2, CHUNK)
     three, some = (f, (rows, 3)), 2 * shading.CHUNK
     sizes: Sizes = {
-        "hidden": (f, (_TAPS, whole(units))),
+        "hidden": (f, (_TAPS, _tiles(units))),
         "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f,
         (CHUNK,)),
         "behind": (np.int64, (CHUNK,)), "mixed": (f, (rows, features)), "mixed_share": (f, (rows,)), "g_features": (f, (rows, features)),
         "g_share": (f, (rows,)), "material": (f, (rows, materials)), "normals": three, "points": three, "directions": three,
-        "slopes": three,
         "g_material": (f, (rows, materials)), "g_normals": three, "mirror_share": (f, (rows,)), "g_mirror_share": (f, (rows,)),
         "at": three, "found": three, "row_of": (np.int64, (rows,)), "shallow": (f, (rows,)),
-        "x": (f, (some, whole(features))), "h": (f, (some, whole(hidden))), "y": (f, (some, whole(materials))),
-        "gy": (f, (some, whole(materials))), "gh": (f, (some, whole(hidden))),
+        "x": (f, (some, _tiles(features))), "h": (f, (some, _tiles(hidden))), "y": (f, (some, _tiles(materials))),
+        "gy": (f, (some, _tiles(materials))), "gh": (f, (some, _tiles(hidden))),
     }  # fmt: skip
     return Store(slots, ChunkScratch, sizes)
 
 
 def light_out(slots: int, features: int, materials: int, hidden: int, lamps: int, outputs: int) -> Store[LightOut]:
     """Of chunks of such rays, K lamps and the shader's outputs."""
-    f, whole = np.float32, _whole
+    f = np.float32
     sizes: Sizes = {
-        "first": (f, (whole(hidden), whole(features))), "first_bias": (f, (whole(hidden),)), "second": (f, (whole(materials),
-        whole(hidden))),
+        "first": (f, (_tiles(hidden), _tiles(features))), "first_bias": (f, (_tiles(hidden),)), "second": (f, (_tiles(materials),
+        _tiles(hidden))),
         "second_bias": (f, (materials,)), "position": (f, (lamps, 3)), "spectrum": (f, (lamps, outputs)), "far": (f, (features,)),
         "loss": (np.float64, ()),
     }  # fmt: skip

@@ -6,27 +6,19 @@ import numpy as np
 from numba import get_thread_id, njit, prange
 
 from mmsynth.field.kernels.cpu.blocks import (
-    SurfaceLayers,
-    padded_output,
     scatter_block,
     surface_block,
     surface_block_backward,
     surface_block_positions,
 )
-from mmsynth.field.kernels.cpu.matrices import padded_to
 
 POINTS = 128  # positions of a block
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def surface_forward(positions, grid, network, keep, store, out):  # type: ignore[no-untyped-def]
+def surface_forward(positions, grid, layers, keep, store, out):  # type: ignore[no-untyped-def]
     """Signed distance of (N, 3) positions; store: see ``SurfaceStore``, a slot per block when ``keep``, else per thread."""
     count = positions.shape[0]
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    layers = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
     for chunk in prange((count + POINTS - 1) // POINTS):
         slot = np.int64(chunk) if keep else np.int64(get_thread_id())
         begin = np.int64(chunk) * POINTS
@@ -40,15 +32,10 @@ def surface_forward(positions, grid, network, keep, store, out):  # type: ignore
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def surface_backward(gradient, active, network, store):  # type: ignore[no-untyped-def]
+def surface_backward(gradient, active, layers, store):  # type: ignore[no-untyped-def]
     """Gradients of the weights per block; hidden units and features become gradients."""
     turned_out, output_out = store.turned_out, store.output_out  # in a parallel loop, numba would not set a tuple's arrays
     count = gradient.shape[0]
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    layers = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
     for chunk in prange((count + POINTS - 1) // POINTS):
         begin = np.int64(chunk) * POINTS
         n = min(POINTS, count - begin)
@@ -60,14 +47,9 @@ def surface_backward(gradient, active, network, store):  # type: ignore[no-untyp
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def surface_positions(gradient, grid, network, store, positions_out):  # type: ignore[no-untyped-def]
+def surface_positions(gradient, grid, layers, store, positions_out):  # type: ignore[no-untyped-def]
     """After ``surface_backward``: gradients of the positions (N, 3)."""
     count = gradient.shape[0]
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    layers = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
     for chunk in prange((count + POINTS - 1) // POINTS):
         begin = np.int64(chunk) * POINTS
         n = min(POINTS, count - begin)

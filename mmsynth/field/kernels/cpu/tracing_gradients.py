@@ -9,15 +9,12 @@ from numba import njit, prange
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cpu.blocks import (
-    SurfaceLayers,
-    padded_output,
     position_block,
     scatter_block,
     surface_block_backward,
     surface_block_positions,
 )
 from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
-from mmsynth.field.kernels.cpu.matrices import padded_to
 
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
@@ -78,18 +75,13 @@ def samples_backward(block, hidden, g, samples, active, layers, turned_out, outp
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def trace_backward(  # type: ignore[no-untyped-def]
-    behind, g_features, g_weight, features, shown, sharpness, active, network, a_active, store
+    behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
     """Gradients of what ``trace_forward`` stored: weights per chunk; distances and feature rows are replaced by their gradients.
 
     behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
     """
     rays = behind.shape[0]
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    layers = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
     for task in prange((rays + CHUNK - 1) // CHUNK):
         chunk = np.int64(task)
         begin = chunk * CHUNK
@@ -133,14 +125,9 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def trace_rays_backward(origins, directions, grid, network, appearance, store, origins_out, directions_out):  # type: ignore[no-untyped-def]
+def trace_rays_backward(origins, directions, grid, layers, appearance, store, origins_out, directions_out):  # type: ignore[no-untyped-def]
     """After ``trace_backward``: gradients to origins and directions, with the samples' ray distances held fixed."""
     rays = origins.shape[0]
-    inputs, units = store.block.shape[2], store.hidden.shape[2]
-    layers = SurfaceLayers(
-        padded_to(network.hidden, units, inputs), padded_to(network.hidden.T, inputs, units), padded_output(network.output, units),
-        network.inner_radius, network.outer_radius,
-    )  # fmt: skip
     contracted = grid.extent > np.float32(1.0)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(chunk) * CHUNK

@@ -16,23 +16,8 @@ from mmsynth.field.kernels.cuda.shared import jit, tl, triton
 from mmsynth.field.kernels.cuda.slopes import eikonal_programs, eikonal_term, normals_backward, places
 from mmsynth.field.kernels.cuda.surface import surface_gradient
 from mmsynth.field.kernels.cuda.tracing import trace
-from mmsynth.field.kernels.parameters import (
-    Eikonal,
-    Gains,
-    GridTable,
-    Lamps,
-    Learned,
-    LightNetwork,
-    Measured,
-    Mirrors,
-    Opacities,
-    Rays,
-    Sampling,
-    ShadedRays,
-    ShaderWeights,
-    SurfaceNetwork,
-    View,
-)
+from mmsynth.field.kernels.learning import gradient_of
+from mmsynth.field.kernels.parameters import Gains, Lamps, Learned, Mirrors, ShadedRays, Step
 
 _BLOCK = 1024
 _ROWS, _COLUMNS = 64, 32  # of partial sums at a time
@@ -99,7 +84,7 @@ def _gain_of(gains: Gains) -> Tensor:
 def _gain_backward(gains: Gains, gain: Tensor, gradient: Tensor) -> None:
     """Add to the gradient of log_gain; by atomics, whose order differs from run to run. Exposures are relative to their mean, so what was
     there and what is added are free of a mean."""
-    out = _gradient(gains.log_gain)
+    out = gradient_of(gains.log_gain)
     with torch.cuda.device_of(out):
         gains_by_frame_kernel[(triton.cdiv(len(gain), _BLOCK),)](gain, gradient, gains.frame, out, len(gain), _BLOCK)
         mean_free_kernel[(1,)](out, len(out), _BLOCK)
@@ -115,30 +100,7 @@ def _add_rows(parts: Tensor, first: Tensor, second: Tensor) -> None:
             )
 
 
-def _gradient(tensor: Tensor) -> Tensor:
-    if tensor.grad is None:
-        tensor.grad = torch.zeros_like(tensor)
-    return tensor.grad
-
-
-def learn_all(
-    grid: GridTable,
-    network: SurfaceNetwork,
-    appearance: GridTable,
-    states: Tensor,
-    shader: ShaderWeights,
-    light: LightNetwork,
-    far_light: Tensor,
-    rays: Rays,
-    view: View,
-    measured: Measured,
-    gains: Gains,
-    opacities: Opacities,
-    eikonal: Eikonal,
-    sampling: Sampling,
-    of_shader: Tensor,
-    of_light: Tensor,
-) -> Learned:
+def learn_all(step: Step, of_shader: Tensor, of_light: Tensor) -> Learned:
     """``learn``, of which gradients are added to the ``grad`` of what is left, and those of
 
         of_shader: the shader's weights and the far light, one after the other, as they are given, to this array (W,).
@@ -147,6 +109,7 @@ def learn_all(
     Returns:
         the loss (n,) float64, to be summed.
     """
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
     with torch.enable_grad():
         hits = trace(grid, network, appearance, states, rays, sampling)
     features, share, shines = hits.features.detach(), hits.share.detach(), len(light.used) > 0
@@ -179,30 +142,13 @@ def learn_all(
     return Learned(loss, compared.squared, hits.samples)
 
 
-def learn(
-    grid: GridTable,
-    network: SurfaceNetwork,
-    appearance: GridTable,
-    states: Tensor,
-    shader: ShaderWeights,
-    light: LightNetwork,
-    far_light: Tensor,
-    rays: Rays,
-    view: View,
-    measured: Measured,
-    gains: Gains,
-    opacities: Opacities,
-    eikonal: Eikonal,
-    sampling: Sampling,
-) -> Learned:
+def learn(step: Step) -> Learned:
     """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
-    weights = [*shader, far_light], [*(light[:6] if len(light.used) else ())]
-    sums = [rays.origins.new_zeros(sum(w.numel() for w in some)) for some in weights]
-    found = learn_all(
-        grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, *sums
-    )
+    weights = [*step.shader, step.far_light], [*(step.light[:6] if len(step.light.used) else ())]
+    sums = [step.rays.origins.new_zeros(sum(w.numel() for w in some)) for some in weights]
+    found = learn_all(step, *sums)
     for some, whole in zip(weights, sums, strict=True):
         for weight, part in zip(some, whole.split([w.numel() for w in some]) if some else (), strict=True):
             if weight.numel():
-                _gradient(weight).add_(part.view_as(weight))
+                gradient_of(weight).add_(part.view_as(weight))
     return found._replace(loss=found.loss.sum().float())

@@ -20,8 +20,7 @@ _PROGRAMS_PER_CORE = 4  # of a persistent kernel, for each multiprocessor
 # numbers that a kernel must not be compiled anew for where they happen to be 1 or multiples of 16
 _PLAIN = [
     "count", "rays", "rows", "levels", "active", "grid", "width", "stride", "size", "bright", "bisections", "lamps", "asked", "drawn",
-    "modalities", "first",
-    "second", "third", "fourth", "tile_bisections", "frame_bisections",
+    "modalities", "first", "second", "third", "fourth", "tile_bisections", "frame_bisections",
 ]  # fmt: skip
 
 

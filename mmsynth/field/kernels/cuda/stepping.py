@@ -10,12 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from mmsynth.field.kernels.constants import BLACK
 from mmsynth.field.kernels.cuda.drawing import random_bits, unit
 from mmsynth.field.kernels.cuda.shared import jit, position, tl, triton
 from mmsynth.field.kernels.parameters import Drawn, Opacities, Rays, View
 
 BLOCK = 128
-_BLACK = 0.02  # of its modality's level: darker is black
 _TWO_PI = 2.0 * math.pi
 
 
@@ -151,7 +151,7 @@ def aim(
         aim_kernel[(triton.cdiv(count, BLOCK),)](
             origins, directions, drawn.alpha, drawn.ray_weight, m.target, m.level,
             tables.begins, tables.values, tables.degrees, tables.trains, near, far, degrees, trains, *opacities[:4],
-            count, rays, len(tables.values), *known[:5], *bounds, _BLACK, contracted, known.any, known.black, BLOCK,
+            count, rays, len(tables.values), *known[:5], *bounds, BLACK, contracted, known.any, known.black, BLOCK,
         )  # fmt: skip
     return Rays(origins, directions, near, far, jitter), View(degrees, trains), opacities
 

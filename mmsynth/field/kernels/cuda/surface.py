@@ -26,6 +26,7 @@ from mmsynth.field.kernels.cuda.shared import (
     tl,
     triton,
 )
+from mmsynth.field.kernels.learning import gradient_of
 from mmsynth.field.kernels.parameters import GridTable, SurfaceNetwork
 
 BLOCK = 64  # positions per program
@@ -250,11 +251,7 @@ def padded_units(units: int) -> int:
 
 def table_gradient(table: Tensor) -> Tensor | None:
     """Where a table's gradient is added to; None: it has none."""
-    if not table.requires_grad:
-        return None
-    if table.grad is None:
-        table.grad = torch.zeros_like(table)
-    return table.grad
+    return gradient_of(table) if table.requires_grad else None
 
 
 def surface_backward(
