@@ -43,7 +43,7 @@ def _softplus(x):  # type: ignore[no-untyped-def]
     return max(x, _ZERO) + _f(math.log1p(math.exp(-abs(x))))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _terms(row, k, lamps, mirrors, polarized, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.reflect``, of one surface and lamp.
 
@@ -81,7 +81,7 @@ def _terms(row, k, lamps, mirrors, polarized, out):  # type: ignore[no-untyped-d
     out[20] = (s * s - p * p) / (s * s + p * p)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _amount(alpha, strength, visible, terms):  # type: ignore[no-untyped-def]
     """Relative light of one surface and lamp; fills A and B of the terms."""
     square, c = alpha * alpha, _f(0.5) * alpha
@@ -91,7 +91,7 @@ def _amount(alpha, strength, visible, terms):  # type: ignore[no-untyped-def]
     return u * u * terms[12] / (terms[14] * terms[15]) * terms[16] * strength * visible
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")
 def _around(row, mirrors, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.surround``, of one surface. out: w 0:3, |w|² 3, F / F(1) 4, D_m and D_t over sin² 5, 6."""
     vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
