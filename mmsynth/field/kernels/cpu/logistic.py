@@ -1,4 +1,4 @@
-"""The logistic distribution of many numbers at once, in double precision: what LLVM does not make vectors of by itself."""
+"""The logistic distribution of many numbers at once: exponentials that LLVM makes vectors of, as it does not of those of ``math``."""
 
 from __future__ import annotations
 
@@ -15,16 +15,23 @@ _EXP = tuple(1.0 / math.factorial(k) for k in range(12))
 _ATANH = tuple(2.0 / (2 * k + 1) for k in range(13))
 
 
+_f = np.float32
+_MOST_SINGLE, _LOG2E_SINGLE, _LN2_HIGH_SINGLE, _LN2_LOW_SINGLE = _f(80.0), _f(_LOG2E), _f(0.693359375), _f(-2.12194440e-4)
+_EXP_SINGLE, _ATANH_SINGLE = tuple(map(_f, _EXP[:8])), tuple(map(_f, _ATANH[:7]))
+
+
 @intrinsic
 def _power_of_two(typingctx, exponent):  # type: ignore[no-untyped-def]
-    """2^k of a whole number k >= -1022, from its bits."""
+    """2^k from its bits: in single precision of an int32 k >= -126, in double of an int64 k >= -1022."""
+    single = exponent == types.int32
+    bias, mantissa = (127, 23) if single else (1023, 52)
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        i64 = ir.IntType(64)
-        whole = builder.add(builder.fptosi(args[0], i64), ir.Constant(i64, 1023))
-        return builder.bitcast(builder.shl(whole, ir.Constant(i64, 52)), ir.DoubleType())
+        integer = args[0].type
+        whole = builder.add(args[0], ir.Constant(integer, bias))
+        return builder.bitcast(builder.shl(whole, ir.Constant(integer, mantissa)), ir.FloatType() if single else ir.DoubleType())
 
-    return types.float64(types.float64), codegen
+    return (types.float32 if single else types.float64)(exponent), codegen
 
 
 @njit(cache=True, fastmath={"contract", "nsz"}, nogil=True, error_model="numpy")
@@ -49,3 +56,25 @@ def negative_log_cdf(values, n, sharpness, out, density):  # type: ignore[no-unt
             log1p = log1p * square + _ATANH[j]
         out[i] = max(x, 0.0) + z * log1p + 0.0 * x  # what is not finite is seen
         density[i] = (1.0 if x > 0.0 else e) / (1.0 + e)
+
+
+@njit(cache=True, fastmath={"contract", "nsz"}, nogil=True, error_model="numpy")
+def softplus(values, n, out, slope):  # type: ignore[no-untyped-def]
+    """log(1 + e^x) of n numbers and its slope, 1 / (1 + e^-x), in single precision; see ``negative_log_cdf``."""
+    one, two, zero = _f(1.0), _f(2.0), _f(0.0)
+    for i in range(n):
+        x = values[i]
+        size = min(abs(x), _MOST_SINGLE)
+        k = np.int32(-np.int32(size * _LOG2E_SINGLE + _f(0.5)))
+        r = (-size - _f(k) * _LN2_HIGH_SINGLE) - _f(k) * _LN2_LOW_SINGLE
+        e = _EXP_SINGLE[7]
+        for j in range(6, -1, -1):
+            e = e * r + _EXP_SINGLE[j]
+        e *= _power_of_two(k)
+        z = e / (two + e)
+        square = z * z
+        log1p = _ATANH_SINGLE[6]
+        for j in range(5, -1, -1):
+            log1p = log1p * square + _ATANH_SINGLE[j]
+        out[i] = max(x, zero) + z * log1p + zero * x
+        slope[i] = (one if x > zero else e) / (one + e) + zero * x

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from mmsynth.field.kernels.constants import LEAST_ROUGHNESS, REFRACTIVE_INDEX
+from mmsynth.field.kernels.cpu.logistic import softplus
 from mmsynth.field.kernels.cpu.shading import first_at
 
 CHUNK = 64  # rays
@@ -33,14 +34,22 @@ class Gradients(NamedTuple):
     spectrum: np.ndarray
 
 
-@njit(cache=True, inline="always", error_model="numpy")
-def _sigmoid(x):  # type: ignore[no-untyped-def]
-    return _ONE / (_ONE + _f(math.exp(-x))) if x >= _ZERO else _f(math.exp(x)) / (_ONE + _f(math.exp(x)))
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _softplus(x):  # type: ignore[no-untyped-def]
-    return max(x, _ZERO) + _f(math.log1p(math.exp(-abs(x))))
+@njit(cache=True, nogil=True, error_model="numpy")
+def _materials(begin, end, mirrors, behind):  # type: ignore[no-untyped-def]
+    """log(1 + e^x) and its slope, of the materials x of what some rays meet, ray by ray: (surfaces, 5 + K) each."""
+    width, n = mirrors.material.shape[1], 0
+    raw = np.empty((2 * (end - begin), width), np.float32)
+    for o in range(begin, end):
+        for which in range(2 if behind[o] >= 0 else 1):
+            row = o if which == 0 else behind[o]
+            if mirrors.share[row] <= _ZERO:
+                continue
+            for j in range(width):
+                raw[n, j] = mirrors.material[row, j]
+            n += 1
+    soft, gate = np.empty_like(raw), np.empty_like(raw)
+    softplus(raw.reshape(-1), n * width, soft.reshape(-1), gate.reshape(-1))
+    return soft, gate
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -118,8 +127,8 @@ def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
 def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """``mirror`` of some rays; ray0 + begin: the first of them in ``measured.ray``."""
     count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
-    raw = mirrors.material
-    terms = np.empty(21, np.float32)
+    soft, gate = _materials(begin, end, mirrors, behind)
+    terms, place = np.empty(21, np.float32), -1
     last = first_at(measured.ray, ray0 + begin)
     for o in range(begin, end):
         first = last
@@ -130,21 +139,22 @@ def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # typ
             row = o if which == 0 else behind[o]
             if mirrors.share[row] <= _ZERO:
                 continue
-            alpha, strength = _LEAST + (_ONE - _LEAST) * _sigmoid(raw[row, 0]), _softplus(raw[row, 1])
+            place += 1
+            alpha, strength = _LEAST + (_ONE - _LEAST) * gate[place, 0], soft[place, 1]
             if last > bright:
                 _around(row, mirrors, terms)
-                mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
+                mirrored, let_through = soft[place, 2] * terms[4], soft[place, 3]
                 light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
                 for m in range(first, last):
                     e = terms[0] * measured.axes[m - bright, 0] + terms[1] * measured.axes[m - bright, 1]
                     e += terms[2] * measured.axes[m - bright, 2]
                     out[m] += _f(0.5) * mirrors.share[row] * (light + polarized * (_TWO * e * e - terms[3]))
-            polarizing = _sigmoid(raw[row, 4])
+            polarizing = gate[place, 4]
             for k in range(count):
                 _terms(row, k, lamps, mirrors, last > bright, terms)
                 if last > bright:
                     terms[20] *= polarizing
-                amount = mirrors.share[row] * _amount(alpha, strength, _sigmoid(raw[row, 5 + k]), terms)
+                amount = mirrors.share[row] * _amount(alpha, strength, gate[place, 5 + k], terms)
                 for m in range(first, last):
                     passed = _ONE if m < bright else _passed(terms, measured.axes, m - bright)
                     out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
@@ -164,8 +174,8 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
     """``mirror_backward`` of some rays; gradients of the lamps are added to those of the chunk."""
     count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
     g_material, g_normals, g_share, g_position, g_spectrum = out.material, out.normals, out.share, out.position, out.spectrum
-    raw = mirrors.material
-    terms = np.empty(21, np.float32)
+    soft, gate = _materials(begin, end, mirrors, behind)
+    terms, place = np.empty(21, np.float32), -1
     last = first_at(measured.ray, ray0 + begin)
     for o in range(begin, end):
         first = last
@@ -179,15 +189,15 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
             share = mirrors.share[row]
             if share <= _ZERO:
                 continue
-            gate = _sigmoid(raw[row, 0])
-            alpha = _LEAST + (_ONE - _LEAST) * gate
+            place += 1
+            alpha = _LEAST + (_ONE - _LEAST) * gate[place, 0]
             square, c = alpha * alpha, _f(0.5) * alpha
-            strength, slope = _softplus(raw[row, 1]), _sigmoid(raw[row, 1])
-            g_alpha, g_polarizing, polarizing = _ZERO, _ZERO, _sigmoid(raw[row, 4])
+            strength, slope = soft[place, 1], gate[place, 1]
+            g_alpha, g_polarizing, polarizing = _ZERO, _ZERO, gate[place, 4]
             if last > bright:
                 _around(row, mirrors, terms)
                 wx, wy, wz = terms[0], terms[1], terms[2]
-                mirrored, let_through = _softplus(raw[row, 2]) * terms[4], _softplus(raw[row, 3])
+                mirrored, let_through = soft[place, 2] * terms[4], soft[place, 3]
                 light, polarized = mirrored + let_through, mirrored * terms[5] - let_through * terms[6]
                 gwx, gwy, gwz, whole, turned = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
                 for m in range(first, last):
@@ -199,8 +209,8 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
                     gwy += g[m] * (_TWO * e * ey - wy)
                     gwz += g[m] * (_TWO * e * ez - wz)
                 g_share[row] += whole * light + turned * polarized
-                g_material[row, 2] += share * (whole + turned * terms[5]) * terms[4] * _sigmoid(raw[row, 2])
-                g_material[row, 3] += share * (whole - turned * terms[6]) * _sigmoid(raw[row, 3])
+                g_material[row, 2] += share * (whole + turned * terms[5]) * terms[4] * gate[place, 2]
+                g_material[row, 3] += share * (whole - turned * terms[6]) * gate[place, 3]
                 # w = v × n
                 vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
                 pull = share * polarized
@@ -208,7 +218,7 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
                 g_normals[row, 1] += pull * (gwz * vx - gwx * vz)
                 g_normals[row, 2] += pull * (gwx * vy - gwy * vx)
             for k in range(count):
-                visible = _sigmoid(raw[row, 5 + k])
+                visible = gate[place, 5 + k]
                 _terms(row, k, lamps, mirrors, last > bright, terms)
                 amount = _amount(alpha, strength, visible, terms)
                 pull, degree = _ZERO, terms[20]
@@ -259,7 +269,7 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
                 g_position[chunk, k, 1] += (gty - along * ty) / terms[3]
                 g_position[chunk, k, 2] += (gtz - along * tz) / terms[3]
             g_material[row, 4] = g_polarizing * polarizing * (_ONE - polarizing)
-            g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate * (_ONE - gate)
+            g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate[place, 0] * (_ONE - gate[place, 0])
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
