@@ -111,12 +111,13 @@ def opacity() -> list[Method]:
 
 
 def _opacity(problem: str, sdf: Tensor, s: float) -> list[Method]:
-    offsets = torch.arange(0, sdf.numel() + 1, sdf.shape[1])
     density = torch.nn.functional.softplus(-s * sdf.double())
     exact = 1 - torch.exp(-torch.relu(density[:, 1:] - density[:, :-1]).sum(1))
 
     def ours(dtype: torch.dtype) -> Tensor:
-        return reference.section_weights(sdf.to(dtype).reshape(-1), s, offsets)[0].reshape(len(sdf), -1).sum(1)
+        before, after = sdf[:, :-1].to(dtype), sdf[:, 1:].to(dtype)
+        tau = reference.section_depth(before, after, s, torch.zeros_like(before, dtype=torch.bool))
+        return -torch.expm1(-tau.sum(1))
 
     def neus(dtype: torch.dtype) -> Tensor:
         f = torch.sigmoid(sdf.to(dtype) * s)

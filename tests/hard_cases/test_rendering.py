@@ -109,23 +109,52 @@ def test_deep_inside(row: Row) -> None:
     """Falling through the inside of an object at f = -0.05: the exact opacity of a section is 0.641."""
     sdf = torch.tensor([-0.05, -0.052])
     exact = 1 - np.exp(-512 * 0.002)
+    opacity = float(-torch.expm1(-reference.section_depth(sdf[:1], sdf[1:], 512.0, torch.tensor([False]))))
     assert neus_weights(sdf, 512.0)[0] > 0.99
-    assert float(ours(sdf, 512.0)[0]) == pytest.approx(exact, abs=1e-5)
+    assert opacity == pytest.approx(exact, abs=1e-5)
     row(
         "a section deep inside, f = -0.05, s = 512",
         f"NeuS: opacity {neus_weights(sdf, 512.0)[0]:.3f}",
-        f"{ours(sdf, 512.0)[0]:.3f}; exact {exact:.3f}",
+        f"{opacity:.3f}; exact {exact:.3f}",
     )
+
+
+@pytest.mark.parametrize("pair", [(-0.05, -0.052), (-0.052, -0.05), (-0.05, -0.05), (-0.05, 0.01)])
+def test_a_ray_that_enters_the_region_inside_of_something_solid(row: Row, pair: tuple[float, float]) -> None:
+    """What its opacity is asked to lose pulls the distance up, until nothing is there."""
+    sdf, s = torch.tensor(pair, dtype=torch.float64, requires_grad=True), 20.0
+    weights, crossing = kernels.section_weights(sdf, s, torch.tensor([0, 2]))
+    assert float(weights[0].detach()) == pytest.approx(1.0 - 2.0 / (1.0 + np.exp(0.05 * s if min(pair) == -0.05 else 0.052 * s)), abs=1e-12)
+    assert crossing[0] == 0.0
+    (gradient,) = torch.autograd.grad(-torch.log1p(-weights[0]), sdf)
+    assert gradient.sum() < -0.5 * s and not (gradient > 0).any()
+    section = reference.section_depth(sdf[:1], sdf[1:], s, torch.tensor([False]))
+    usual = torch.autograd.grad(section.sum(), sdf)[0].sum()
+    row(
+        f"slope of optical depth over a shift of both ends, a ray beginning inside, s = 20, f = {pair[0]}, {pair[1]}",
+        f"of the difference of both ends: {float(usual):+.2f}",
+        f"{float(gradient.sum()):+.2f}",
+    )
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_rays_that_begin_behind_a_surface_meet_it_where_they_begin(way: str) -> None:
+    parts = _parts()
+    origins, directions = _towards(50, 0.1)
+    inside = torch.full((50,), 2.9), torch.full((50,), 3.3)
+    hits = _trace(way, parts, origins, directions, interval=inside, jitter=0.0)
+    assert (hits.opacity > 0.999).all()
+    torch.testing.assert_close(hits.depth.float(), inside[0], atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("s", [4.0, 20.0])
 def test_a_camera_deep_inside_sees_what_the_formula_says(way: str, s: float) -> None:
-    """From f = -0.05 to the centre at -0.5: log Φ falls by almost s · 0.45, whatever the surface did before."""
+    """From the surface, where all rays come from, to the centre at -0.5: log Φ falls by almost s · 0.5."""
     step = 0.02
     origins, directions = torch.tensor([[0.0, 0.0, -0.45]]), torch.tensor([[0.0, 0.0, 1.0]])
     hits = _trace(way, _parts(), origins, directions, Sampling(s, step, 2, 2, max_optical_depth=100.0), jitter=0.0)
-    tau = softplus(torch.tensor(s * 0.5)) - softplus(torch.tensor(s * 0.05))
+    tau = softplus(torch.tensor(s * 0.5)) - np.log(2.0)
     # the sample next to the centre is half a step from it at most
     assert 1 - np.exp(-float(tau) + s * step / 2) - 1e-3 <= float(hits.opacity.detach()) <= 1 - np.exp(-float(tau)) + 1e-3
 

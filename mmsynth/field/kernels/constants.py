@@ -15,6 +15,7 @@ FACE_OVERSHOOT = 0.1  # of a step, behind the face of a free cell
 NO_CROSSING = 1e9  # distance to a face that a ray runs along; it does so below a velocity of ALONG_FACE
 ALONG_FACE = 1e-9
 
+LN2 = 0.6931471805599453  # -log Φ(0)
 LAYER_GAP = 7.3  # times 1 / sharpness, in the frame of the grid: sections farther apart are of two surfaces (no multiple of a usual step)
 
 HARMONICS = 16  # spherical harmonics up to degree 3

@@ -19,6 +19,7 @@ from mmsynth.field.kernels.constants import (
     LAYER_GAP,
     LEAST_ADVANCE,
     LEAST_WEIGHT,
+    LN2,
     LONGEST_STEP,
     MAX_SAMPLES_PER_RAY,
     NO_CROSSING,
@@ -171,8 +172,8 @@ def march(
         found.append((here, at))
         slope = torch.ones_like(f)
         if k:
-            tau = softplus(-s.sharpness * f.double()) - softplus(-s.sharpness * last[1][here].double())
-            depth[here] += tau.clamp(min=0.0).to(f)
+            before = last[1][here]
+            depth[here] += section_depth(before.double(), f.double(), s.sharpness, torch.full_like(f, k == 1, dtype=torch.bool)).to(f)
             slope = (last[1][here] - f) / ((at - last[0][here]) * speed)
         last[0][here], last[1][here] = at, f
         jump = s.step / slope.clamp(min=s.min_slope)
@@ -204,31 +205,45 @@ def exclusive_sum(values: Tensor, offsets: Tensor, ray: Tensor) -> Tensor:
     return padded.cumsum(1)[ray, column]
 
 
+def section_depth(before: Tensor, after: Tensor, sharpness: float, first: Tensor) -> Tensor:
+    """Optical depth τ of sections by the distances at their ends, see ``section_weights``.
+
+    first: whether it is a ray's first: where that begins behind a surface, f₀ < 0, it has relu(log Φ(0) - log Φ(s f₀)) besides, as if it
+    came from the surface. Where a ray enters the region of interest, or leaves a camera, inside of something solid, that is what it meets,
+    and opacity that should not be there pulls the distance up; a difference of both ends would only turn its slope.
+    """
+    passed = softplus(-sharpness * before)
+    return torch.relu(softplus(-sharpness * after) - passed) + torch.where(first, torch.relu(passed - LN2), torch.zeros_like(passed))
+
+
 def section_weights(sdf: Tensor, sharpness: float, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Volume-rendering weight of every section, from the SDF at its ends, in log space.
 
     With the logistic CDF Φ of NeuS (Wang et al. 2021, eq. 10-13) the optical depth of a section is
     τ = relu(log Φ(s f₀) - log Φ(s f₁)) = relu(softplus(-s f₁) - softplus(-s f₀)) and w = T (1 - e^-τ), T = exp(-Σ τ before).
-    No epsilon: empty space is exactly empty, and Σ w ≤ 1.
+    No epsilon: empty space is exactly empty, and Σ w ≤ 1. A ray comes from the open, see ``section_depth``.
 
     Args:
         sdf: (N,). sharpness: s > 0. offsets: (R + 1,).
     Returns:
         weights: (N,) of the section that starts at each sample; 0 for the last sample of a ray. Differentiable in ``sdf``.
-        crossing: (N,) where in the section the surface is, in [0, 1]: the zero of the chord, ½ where there is none. No gradient.
+        crossing: (N,) where in the section the surface is, in [0, 1]: the zero of the chord, ½ where there is none, 0 where the ray begins
+            behind it. No gradient.
     """
     count = sdf.shape[0]
     last = torch.zeros(count, dtype=torch.bool, device=sdf.device)
     ends = offsets[1:][offsets[1:] > offsets[:-1]] - 1
     last[ends] = True
     following = torch.cat([sdf[1:], sdf[-1:]])
-    tau = torch.relu(softplus(-sharpness * following) - softplus(-sharpness * sdf))
-    tau = torch.where(last, torch.zeros_like(tau), tau)
+    first = torch.zeros_like(last)
+    first[offsets[:-1][offsets[1:] > offsets[:-1]]] = True
+    tau = torch.where(last, torch.zeros_like(sdf), section_depth(sdf, following, sharpness, first))
     ray = torch.repeat_interleave(torch.arange(offsets.shape[0] - 1, device=sdf.device), offsets[1:] - offsets[:-1])
     weights = torch.exp(-exclusive_sum(tau, offsets, ray)) * -torch.expm1(-tau)
     with torch.no_grad():
         crosses = (sdf > 0) & (following <= 0) & ~last
         crossing = torch.where(crosses, sdf / torch.where(crosses, sdf - following, torch.ones_like(sdf)), torch.full_like(sdf, 0.5))
+        crossing = torch.where(first & (sdf < 0), torch.zeros_like(sdf), crossing)
     return weights, crossing
 
 

@@ -175,7 +175,7 @@ def test_a_ray_from_afar_comes_to_an_end(device: str) -> None:
 def test_not_a_number_is_not_hidden(device: str) -> None:
     surface, appearance = _field(device, 1.0)
     with torch.no_grad():
-        surface.grid.table[3] = torch.nan
+        surface.grid.table[:10] = torch.nan
     hits = cuda.trace(*surface.at(3), appearance.at(6), _states("open", 1.0).to(device), _rays(30, 1.0, device), Sampling(20.0, 0.2, 3, 6))
     assert hits.share.isnan().any() and not hits.share.isnan().all()
     hits.share.sum().backward()

@@ -4,10 +4,16 @@ Begin with ``operations``, the autograd functions; the kernels are in ``blocks``
 ``tracing_gradients``, ``shading``, ``mirroring``, ``drawing`` and ``optimiser``.
 """
 
-from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled
-from mmsynth.field.kernels.cpu.drawing import draw, odds
-from mmsynth.field.kernels.cpu.operations import compare, learn, mirror, shade, surface_value, trace
-from mmsynth.field.kernels.cpu.optimiser import adam, adam_together
+from pathlib import Path
+
+from mmsynth.field.kernels.cpu.caching import kept_by_version
+
+with kept_by_version(Path(__file__).parent):
+    from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled
+    from mmsynth.field.kernels.cpu.drawing import draw, odds
+    from mmsynth.field.kernels.cpu.operations import compare, learn, mirror, shade, surface_value, trace
+    from mmsynth.field.kernels.cpu.optimiser import adam, adam_together
+
 from mmsynth.field.kernels.reference import hash_encode, march, section_weights
 
 __all__ = [

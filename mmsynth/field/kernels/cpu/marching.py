@@ -23,6 +23,7 @@ from mmsynth.field.kernels.constants import (
     LAYER_GAP,
     LEAST_ADVANCE,
     LEAST_WEIGHT,
+    LN2,
     LONGEST_STEP,
     MAX_SAMPLES_PER_RAY,
     NO_CROSSING,
@@ -115,6 +116,14 @@ def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted
     return max(t + leave, t * _LEAST_ADVANCE), cx, cy, cz, r, speed, state
 
 
+@njit(cache=True, inline="always", error_model="numpy")
+def section_depth(before, after, first):  # type: ignore[no-untyped-def]
+    """See ``reference.section_depth``, of -log Φ(s f) at both ends."""
+    rise = after - before
+    rise = 0.0 if rise < 0.0 else rise  # not a maximum, which would hide NaN
+    return rise + (before - LN2) if first and before > LN2 else rise
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):  # type: ignore[no-untyped-def]
     """Samples of the rays of a chunk and their distances, see ``reference.march``: how many."""
@@ -194,7 +203,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
             store.time_of[slot, used + a] = t
             slope = np.float32(1.0)
             if k > 0:
-                tau_of[i] += max(0.0, p_of[slot, here] - p_of[slot, here - 1])
+                tau_of[i] += section_depth(p_of[slot, here - 1], p_of[slot, here], k == 1)
                 slope = (f_of[slot, here - 1] - value) / ((t - t_of[slot, here - 1]) * speed_of[i])
             counts[slot, i] = k + 1
             if tau_of[i] > sampling.max_optical_depth or k + 1 == MAX_SAMPLES_PER_RAY or (state_of[i] == SOLID and k > 0):
@@ -235,7 +244,7 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
         depth[o] = np.float32(np.nan)
         for k in range(store.counts[slot, i] - 1):
             here = i * MAX_SAMPLES_PER_RAY + k
-            tau = p_of[slot, here + 1] - p_of[slot, here]
+            tau = section_depth(p_of[slot, here], p_of[slot, here + 1], k == 0)
             store.opacity_of[slot, here] = 0.0
             if tau < 1e-7:
                 continue
@@ -252,6 +261,8 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
                 crossing = np.float32(0.5)
                 if f0 > 0 and f1 <= 0:
                     crossing = f0 / (f0 - f1)
+                elif k == 0 and f0 < 0:
+                    crossing = np.float32(0.0)
                 t0 = t_of[slot, here]
                 t = t0 + crossing * (t_of[slot, here + 1] - t0)
                 if before < 0.5 and before + w >= 0.5:

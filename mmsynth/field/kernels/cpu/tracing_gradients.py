@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, MAX_SAMPLES_PER_RAY
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, LN2, MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cpu.blocks import (
     position_block,
     scatter_block,
@@ -23,7 +23,7 @@ _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store):  # type: ignore[no-untyped-def]
     """Distances and features of the sections become their gradients, of the rays in a slot of the store, of which ``begin`` is the first in
     ``behind``."""
-    sdf, q_of, opacity_of, id_of = store.sdf, store.q_of, store.opacity_of, store.id_of
+    sdf, p_of, q_of, opacity_of, id_of = store.sdf, store.p_of, store.q_of, store.opacity_of, store.id_of
     sections = store.s_count[chunk, 0]
     sf = store.s_block[chunk]
     at = 0
@@ -61,8 +61,12 @@ def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, s
                 transmittance -= w
                 # p is -log of the sigmoid of s f, so its slope is -s (1 - e^-p)
                 d_tau = (g_section[k] * transmittance - total) * sharpness
-                sdf[chunk, id_of[chunk, first + k]] += np.float32(d_tau * q_of[chunk, first + k])
-                sdf[chunk, id_of[chunk, first + k + 1]] -= np.float32(d_tau * q_of[chunk, first + k + 1])
+                here, end = first + k, first + k + 1
+                if k > 0 or p_of[chunk, here] <= LN2:
+                    sdf[chunk, id_of[chunk, here]] += np.float32(d_tau * q_of[chunk, here])
+                elif p_of[chunk, here] > p_of[chunk, end]:  # a ray that begins behind a surface: of the end that is deeper
+                    end = here
+                sdf[chunk, id_of[chunk, end]] -= np.float32(d_tau * q_of[chunk, end])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -11,6 +11,7 @@ from mmsynth.field.kernels.cuda.shared import (
     ALONG_FACE,
     FACE_OVERSHOOT,
     LEAST_ADVANCE,
+    LN2,
     LONGEST_STEP,
     MAX_SAMPLES,
     NO_CROSSING,
@@ -36,11 +37,13 @@ def _softplus(x):  # type: ignore[no-untyped-def]
 
 
 @jit
-def optical_depth(f0, f1, sharpness):  # type: ignore[no-untyped-def]
-    """Optical depth of sections with sdf f0, f1 at their ends, see ``reference.section_weights``."""
+def optical_depth(f0, f1, sharpness, first):  # type: ignore[no-untyped-def]
+    """Optical depth of sections with sdf f0, f1 at their ends, see ``reference.section_depth``."""
     # double: at s = 1e6 single precision would leave 0.1 of noise in the difference
-    tau = _softplus(-sharpness * f1.to(tl.float64)) - _softplus(-sharpness * f0.to(tl.float64))
-    return tl.where(tau < 0.0, 0.0, tau).to(tl.float32)  # not a maximum, which would hide NaN
+    before = _softplus(-sharpness * f0.to(tl.float64))
+    rise = _softplus(-sharpness * f1.to(tl.float64)) - before
+    rise = tl.where(rise < 0.0, 0.0, rise)  # not a maximum, which would hide NaN
+    return tl.where(first & (before > LN2), rise + (before - LN2), rise).to(tl.float32)
 
 
 @jit
@@ -136,7 +139,7 @@ def march_kernel(  # type: ignore[no-untyped-def]
         met = (ray < rays) & (t < far)
         f = distance(x, y, z, met, table, resolutions, offsets, active, scale, hidden, width, output, inner, outer, UNITS, HIDDEN, FEATURES)
         later = met & (k > 0)
-        tau = tl.where(later, optical_depth(f0, f, sharpness), 0.0)
+        tau = tl.where(later, optical_depth(f0, f, sharpness, k == 1), 0.0)
         depth += tau
         at = found + k * rays + ray
         tl.store(at, t, mask=met)

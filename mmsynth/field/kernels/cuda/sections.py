@@ -59,7 +59,9 @@ def weigh_kernel(  # type: ignore[no-untyped-def]
         # the ray was ended here: what is left belongs to this surface, too
         w = tl.where(dense, tl.where(passed > max_optical_depth, w + tl.exp(-passed), w), 0.0)
         crosses = (f0 > 0.0) & (f1 <= 0.0)
-        t = t0 + tl.where(crosses, f0 / tl.where(crosses, f0 - f1, 1.0), 0.5) * (t1 - t0)
+        # a ray that begins behind a surface meets it there
+        middle = tl.where((f0 < 0.0) & (k == 0), 0.0, 0.5)
+        t = t0 + tl.where(crosses, f0 / tl.where(crosses, f0 - f1, 1.0), middle) * (t1 - t0)
         half = tl.where(dense & (before < 0.5) & (before + w >= 0.5), t, half)
         matters = dense & (w > min_section_weight)
         x, y, z, _ = contracted(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTED)
@@ -161,12 +163,14 @@ def weigh_backward_kernel(  # type: ignore[no-untyped-def]
         met = dense | was_dense
         e = tl.exp(-tl.abs(sharpness * f0.to(tl.float64)))
         slope = sharpness * (tl.where(f0 <= 0.0, 1.0, e) / (1.0 + e))
-        tl.store(out + slot, (slope * (of_tau - ending).to(tl.float64)).to(tl.float32), mask=met)
+        begins_behind = (f0 < 0.0) & (k == 0)  # then of the end that is deeper
+        here = tl.where(begins_behind, tl.where(f0 < f1, -of_tau, 0.0), of_tau)
+        tl.store(out + slot, (slope * (here - ending).to(tl.float64)).to(tl.float32), mask=met)
         tl.store(time_out + slot, t0, mask=met)
         tl.store(ray_out + slot, ray, mask=met)
         slot += met.to(tl.int32)
         passed = tl.where(dense, passed + tau, passed)
-        ending, was_dense = of_tau, dense
+        ending, was_dense = tl.where(begins_behind & (f0 < f1), 0.0, of_tau), dense
         j += matters.to(tl.int32)
         next_k = tl.where(matters, tl.load(section_k + j * rays + ray, mask=matters & (j < listed), other=-1), next_k)
         t0, f0 = t1, f1

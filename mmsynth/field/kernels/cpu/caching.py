@@ -1,0 +1,38 @@
+"""Where compiled kernels are kept: apart for every version of their sources.
+
+Numba knows for each function whether its own file changed, and not the files of what it inlines: after an update a kernel would go on
+with parts of the old ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from numba import config
+from numba.misc.appdirs import AppDirs
+
+
+def version_of_sources(folder: Path) -> str:
+    """Of the kernels in a folder, and of the numbers that they share with others beside it."""
+    digest = hashlib.sha256()
+    for path in sorted([*folder.glob("*.py"), *folder.parent.glob("*.py")]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@contextmanager
+def kept_by_version(folder: Path) -> Iterator[None]:
+    """Kernels that are defined meanwhile keep their code in a folder of this version: in numba's own cache folder if one is set, beside the
+    sources, or where nothing may be written there, with the user's caches."""
+    before = config.CACHE_DIR
+    beside = folder / "__pycache__"
+    beside = beside if os.access(beside if beside.exists() else folder, os.W_OK) else Path(AppDirs("mmsynth").user_cache_dir)
+    config.CACHE_DIR = str((Path(before) if before else beside) / f"kernels-{version_of_sources(folder)}")
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before

@@ -1,0 +1,48 @@
+"""Compiled code that belongs to other sources is never used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numba
+import pytest
+
+from mmsynth.field.kernels.cpu import KERNELS, caching
+
+
+def _folder(path: Path) -> Path:
+    (path / "kernels").mkdir(parents=True)
+    (path / "numbers.py").write_text("ONE = 1\n")
+    (path / "kernels" / "blocks.py").write_text("def inner(x):\n    return x + 1\n")
+    (path / "kernels" / "surface.py").write_text("from blocks import inner\n")
+    return path / "kernels"
+
+
+@pytest.mark.parametrize("changed", ["kernels/blocks.py", "kernels/new.py", "numbers.py"])
+def test_a_change_of_any_source_is_another_version(tmp_path: Path, changed: str) -> None:
+    folder = _folder(tmp_path)
+    before = caching.version_of_sources(folder)
+    assert caching.version_of_sources(_folder(tmp_path / "copy")) == before
+    (tmp_path / changed).write_text("def inner(x):\n    return x + 2\n")
+    assert caching.version_of_sources(folder) != before
+
+
+def test_each_version_has_its_folder_and_other_code_keeps_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = _folder(tmp_path)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    with caching.kept_by_version(folder):
+        beside = Path(numba.config.CACHE_DIR)
+    assert beside == folder / "__pycache__" / f"kernels-{caching.version_of_sources(folder)}"
+    assert numba.config.CACHE_DIR == ""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "mine"))
+    with caching.kept_by_version(folder):
+        assert Path(numba.config.CACHE_DIR).parent == tmp_path / "mine"
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(caching.os, "access", lambda *_: False)
+    with caching.kept_by_version(folder):
+        assert tmp_path not in Path(numba.config.CACHE_DIR).parents and "mmsynth" in numba.config.CACHE_DIR
+
+
+def test_the_kernels_are_kept_by_version() -> None:
+    version = caching.version_of_sources(Path(caching.__file__).parent)
+    assert all(Path(kernel._cache._cache_path).parent.name == f"kernels-{version}" for kernel in KERNELS)
