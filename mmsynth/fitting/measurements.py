@@ -129,6 +129,36 @@ class Measurements(Mapping[str, Modality]):
             all_frames[first : first + len(own)] = torch.from_numpy(own)
 
 
+def drawing_of(
+    measurements: Measurements,
+    columns: Mapping[str, slice] | None,
+    rays: Mapping[str, int],
+    random: np.random.Generator,
+    selection: kernels.Selection | None = None,
+) -> kernels.Drawing:
+    """What kernels draw for a random batch, see ``draw``."""
+    modalities = measurements.modalities
+    if columns is not None:
+        output = torch.tensor([columns[n].start if n in rays else 0 for n in measurements.order], dtype=torch.int32)
+        modalities = modalities._replace(output=output.to(modalities.output.device))
+    first, second = random.integers(0, 1 << 32, 2).tolist()
+    return kernels.Drawing(
+        measurements.frames, measurements.cameras, modalities, measurements.chosen if selection is None else selection,
+        [rays.get(n, 0) for n in measurements.order], (first, second),
+    )  # fmt: skip
+
+
+def batch_of(measurements: Measurements, rays: Mapping[str, int], drawn: kernels.Drawn) -> Batch:
+    """What was drawn, so many rays of some modalities."""
+    parts: dict[str, tuple[slice, slice]] = {}
+    r = m = 0
+    for name in (n for n in measurements.order if n in rays):
+        count, numbers = rays[name], rays[name] * measurements[name].values
+        parts[name] = slice(r, r + count), slice(m, m + numbers)
+        r, m = r + count, m + numbers
+    return Batch(**drawn._asdict(), parts=parts)
+
+
 def draw(
     measurements: Measurements,
     columns: Mapping[str, slice] | None,
@@ -142,32 +172,17 @@ def draw(
         columns: the shader outputs of each modality, None: each from 0. rays: how many of some modalities.
         selection: of which pixels, and how often each; None: of all that are learned from, all alike.
     """
-    order = [n for n in measurements.order if n in rays]
-    modalities = measurements.modalities
-    if columns is not None:
-        output = torch.tensor([columns[n].start if n in rays else 0 for n in measurements.order], dtype=torch.int32)
-        modalities = modalities._replace(output=output.to(modalities.output.device))
-    first, second = random.integers(0, 1 << 32, 2).tolist()
-    drawn = kernels.draw(
-        measurements.frames, measurements.cameras, modalities, measurements.chosen if selection is None else selection,
-        [rays.get(n, 0) for n in measurements.order], (first, second),
-    )  # fmt: skip
-    parts: dict[str, tuple[slice, slice]] = {}
-    r = m = 0
-    for name in order:
-        count, numbers = rays[name], rays[name] * measurements[name].values
-        parts[name] = slice(r, r + count), slice(m, m + numbers)
-        r, m = r + count, m + numbers
-    return Batch(**drawn._asdict(), parts=parts)
+    return batch_of(measurements, rays, kernels.draw(*drawing_of(measurements, columns, rays, random, selection)))
 
 
-def draw_empty(measurements: Measurements, rays: Mapping[str, int], random: np.random.Generator) -> Batch:
-    """Random rays along which nothing is, as masks of an object say; what was measured along them means nothing.
+def empty_drawing_of(measurements: Measurements, rays: Mapping[str, int], random: np.random.Generator) -> kernels.Drawing:
+    """Random rays along which nothing is, as masks of an object say; what is measured along them means nothing.
 
     Args:
         rays: how many of each modality; those without such masks give none.
     """
-    return draw(measurements, None, {n: count for n, count in rays.items() if measurements[n].empty}, random, measurements.empty)
+    some = {n: count for n, count in rays.items() if measurements[n].empty}
+    return drawing_of(measurements, None, some, random, measurements.empty)
 
 
 def load_measurements(

@@ -38,10 +38,11 @@ class Adam:
         for name, p in self.parameters.items():
             if p.grad is not None:
                 rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
-                met = slice((rows or {}).get(name))
                 first, second = self.moments[name]
                 step = kernels.AdamStep(rate, *BETAS, EPSILON, self.count, name in self.sparse)
-                parts.append((p[met], p.grad[met], first[met], second[met], step))
+                met = None if rows is None else rows.get(name)
+                all_of = p, p.grad, first, second, step
+                parts.append(all_of if met is None else (p[:met], p.grad[:met], first[:met], second[:met], step))
         kernels.adam_together(parts)
 
     def resize(self, name: str, kept: int) -> None:

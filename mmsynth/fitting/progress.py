@@ -25,11 +25,13 @@ class FitProgress:
 
 @dataclass
 class FitState:
-    """The counters of a fit, and what was decided in it; ``rays``: of the next step, ``reopened``: how often the occupancy grid was."""
+    """The counters of a fit, and what was decided in it; ``rays``, ``rays_after``: of the next step and the one after it, ``reopened``: how
+    often the occupancy grid was."""
 
     step: int = 0
     elapsed: float = 0.0
     rays: int = 0
+    rays_after: int = 0
     rays_total: int = 0
     samples_total: int = 0
     bad_steps: int = 0

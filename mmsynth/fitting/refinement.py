@@ -21,9 +21,9 @@ from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian
 from mmsynth.fitting.recipe import PosesRecipe
 from mmsynth.scene.scene import Scene
 
-_AT_ONCE = 4096  # rays of a batch
-_DECIDE = 8  # batches at least, by which it is decided
-_PER_VIEW = 64  # rays of a step at least
+_AT_ONCE = 2048  # rays of a batch: all that it goes through is kept for the way back
+_DECIDE = 16  # batches at least, by which it is decided
+_PER_STEP, _PER_VIEW = 4096, 64  # rays of a step at least
 _PER_FIT = 400_000  # rays from the beginning to the end of a fit
 _PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
 
@@ -107,7 +107,7 @@ class Refinement:
             look: rays of the present field, a number of each modality: their residuals and derivatives.
         """
         random = np.random.default_rng((self.seed, 3, self.steps))
-        rays = max(_AT_ONCE, _PER_VIEW * len(self.layout.views))
+        rays = max(_PER_STEP, _PER_VIEW * len(self.layout.views))
         count = -(-rays // _AT_ONCE) if self.decided is not None else max(_DECIDE, -(-rays // _AT_ONCE))
         counts = {n: -(-_AT_ONCE * len(m.origins) // len(self.layout.view)) for n, m in self.measurements.items()}
         equations = poses.normal_equations((look(counts, random) for _ in range(count)), poses.moved(self.layout, self.motions))

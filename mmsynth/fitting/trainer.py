@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,13 +18,14 @@ from pydantic import TypeAdapter
 from torch.nn.functional import pad
 
 from mmsynth.errors import DivergedError, InputError
-from mmsynth.field import kernels, rendering
+from mmsynth.field import kernels
 from mmsynth.field.field import Field
+from mmsynth.fitting.ahead import DrawnStep, ToDraw, drawn_step
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
-from mmsynth.fitting.measurements import Batch, Measurements, draw, draw_empty, fingerprint, load_measurements
+from mmsynth.fitting.measurements import Batch, Measurements, draw, drawing_of, empty_drawing_of, fingerprint, load_measurements
 from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.needs import Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
@@ -83,7 +85,7 @@ class Trainer:
         self.average = Average(parameters)
         self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
-        self.state = FitState(rays=recipe.sampling.initial_rays)
+        self.state = FitState(rays=recipe.sampling.initial_rays, rays_after=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
         self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
@@ -97,6 +99,7 @@ class Trainer:
             self.on_device = DeviceStep(*given)
             self.state.rays = max(self.state.rays, self.on_device.first_rays)
         self.prepared: tuple[Any, ...] = ()  # of the last step on the device, what was then
+        self.coming: DrawnStep | None = None
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -127,15 +130,19 @@ class Trainer:
     def run_step(self) -> None:
         """One optimiser step."""
         state = self.state
-        random = np.random.default_rng((self.seed, 1, state.step))
-        generator = torch.Generator().manual_seed(int(random.integers(2**62)))
         sampling = sampling_at(self.progress, self.recipe, self.needs)
-        self._prepare(sampling, generator)
         if self.on_device is not None:
+            self._prepare(sampling, self._random(state.step)[1])
             self._step_on(self.on_device, sampling)
             return
-        batch = self._draw(random)
-        learned = self._learn(batch, sampling, random, generator)
+        drawn = self.coming
+        if drawn is None:  # the first step of all, or after a checkpoint: by poses and residuals as they were in the step before
+            asked = self._to_draw(state.step, state.rays)
+            drawn = drawn_step(self.field, self.measurements, asked, [kernels.draw(*drawing) for drawing in asked.drawings])
+        self._prepare(sampling, drawn.generator)
+        asked = self._to_draw(state.step + 1, state.rays_after)
+        learned, rays, state.rays = self._learn(drawn, sampling, asked.drawings), state.rays, state.rays_after
+        self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
         wrong = self._wrong(learned.loss)
         if wrong is not None:
             self._skip(wrong)
@@ -144,17 +151,21 @@ class Trainer:
         keep = 0.98 if state.step else 0.0
         value, before, samples = float(learned.loss), state.mean_loss, int(learned.samples)
         state.mean_loss = value if math.isnan(before) else keep * before + (1 - keep) * value  # nan: all were skipped
-        for name, error in self._errors(batch, learned.squared).items():
+        for name, error in self._errors(drawn.batch, learned.squared).items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
-        state.rays_total += len(batch.origins)
+        state.rays_total += len(drawn.batch.origins)
         state.samples_total += samples
-        self._adapt_rays(self.recipe.sampling.samples_per_step, samples, _MOST_RAYS)
+        state.rays_after = self._adapted(rays, self.recipe.sampling.samples_per_step, samples, _MOST_RAYS)
         state.step += 1
 
-    def _adapt_rays(self, wanted: int, samples: float, most: int) -> None:
-        """A fixed number of samples a step: the number of rays follows, by at most a factor of two either way."""
+    def _adapted(self, rays: int, wanted: int, samples: float, most: int) -> int:
+        """A fixed number of samples a step: the number of rays follows, by at most a factor of two either way.
+
+        Args:
+            rays: that gave so many samples.
+        """
         ratio = min(2.0, max(0.5, wanted / max(samples, 1)))
-        self.state.rays = int(min(most, max(len(self.measurements), 0.5 * self.state.rays * (1 + ratio))))
+        return int(min(most, max(len(self.measurements), 0.5 * rays * (1 + ratio))))
 
     def _step_on(self, step: DeviceStep, sampling: kernels.Sampling) -> None:
         """A step that the device takes while the host goes on; what earlier ones told is taken in."""
@@ -185,7 +196,8 @@ class Trainer:
             state.mean_loss = news.loss if keep == 0.0 else keep * state.mean_loss + (1 - keep) * news.loss
             for name, error in news.errors.items():
                 state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
-        self._adapt_rays(max(self.recipe.sampling.samples_per_step, step.samples), news.samples / news.steps, step.most_rays)
+        wanted = max(self.recipe.sampling.samples_per_step, step.samples)
+        state.rays = self._adapted(state.rays, wanted, news.samples / news.steps, step.most_rays)
 
     def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
         """What is due before a step: the occupancy grid, where rays go, the rows of the tables, what residuals decide, the poses."""
@@ -219,18 +231,23 @@ class Trainer:
         if self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
 
-    def _draw(self, random: np.random.Generator) -> Batch:
-        return draw(self.measurements, self.field.shader.columns, self._rays(), random, self.importance.selection)
+    def _random(self, step: int) -> tuple[np.random.Generator, torch.Generator]:
+        """The random numbers of a step."""
+        random = np.random.default_rng((self.seed, 1, step))
+        return random, torch.Generator().manual_seed(int(random.integers(2**62)))
 
-    def _rays(self) -> dict[str, int]:
-        """Of a step, how many of each modality."""
+    def _to_draw(self, step: int, rays: int) -> ToDraw:
+        """The rays of a step."""
+        random, generator = self._random(step)
         total = sum(self.needs.share.values())
-        return {n: max(1, int(self.state.rays * share / total)) for n, share in self.needs.share.items()}
-
-    def _rays_outside(self, random: np.random.Generator) -> Batch:
-        """Some rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the
-        object's, or of a picture that was painted white there: they are not looked at."""
-        return draw_empty(self.measurements, {name: -(-count // _OUTSIDE) for name, count in self._rays().items()}, random)
+        counts = {n: max(1, int(rays * share / total)) for n, share in self.needs.share.items()}
+        of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, self.importance.selection)
+        if not self.has_empty:
+            return ToDraw(counts, (of_pixels,), generator)
+        # rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the object's, or
+        # of a picture that was painted white there: they are not looked at
+        outside = {name: -(-count // _OUTSIDE) for name, count in counts.items()}
+        return ToDraw(counts, (of_pixels, empty_drawing_of(self.measurements, outside, random)), generator)
 
     def _wrong(self, loss: torch.Tensor) -> str | None:
         """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
@@ -257,31 +274,25 @@ class Trainer:
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _learn(self, batch: Batch, sampling: kernels.Sampling, random: np.random.Generator, generator: torch.Generator) -> kernels.Learned:
-        """The loss of a batch; gradients are added to ``grad`` of all that is learned."""
-        field, origins, directions, jitter = self.field, batch.origins, batch.directions, batch.jitter
-        if self.has_empty:
-            more = self._rays_outside(random)
-            origins, directions = torch.cat([origins, more.origins]), torch.cat([directions, more.directions])
-            jitter = torch.cat([jitter, more.jitter])
-        count = len(origins)
-        near, far = rendering.interval(field.surface, origins, directions)
-        rays = kernels.Rays(origins, directions, near, far, jitter)
+    def _learn(self, drawn: DrawnStep, sampling: kernels.Sampling, ahead: Sequence[kernels.Drawing]) -> kernels.Learned:
+        """The loss of a batch; gradients are added to ``grad`` of all that is learned. Other rays are drawn beside it."""
+        field, batch, rays = self.field, drawn.batch, drawn.rays
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
-        outside = count - len(trains)
+        outside = len(rays.origins) - len(trains)
         view = kernels.View(*(pad(x, (0, outside), value=y) for x, y in ((batch.per_ray(field.view_dependence), 0), (trains, True))))
         light = field.light.network() if field.light is not None and field.shines else kernels.no_light(self.device)
         # light from beyond the region would explain what is in it as long as that has no shape
-        far_light = field.far_light if field.far_light is not None and self.state.decided is not None else origins.new_empty(0)
-        log_gain = self.log_gain if self._has_gains else origins.new_empty(0)
+        none = rays.origins.new_empty(0)
+        far_light = field.far_light if field.far_light is not None and self.state.decided is not None else none
+        log_gain = self.log_gain if self._has_gains else none
         step = kernels.Step(
             *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
             field.shader.weights(), light, far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
-            eikonal(field, sampling, self.recipe, self.progress, generator), sampling,
+            eikonal(field, sampling, self.recipe, self.progress, drawn.generator), sampling,
         )  # fmt: skip
-        return kernels.learn(step)
+        return kernels.learn(step, ahead)
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
@@ -376,6 +387,7 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
+        self.coming = None
         if self.on_device is not None:
             self.on_device.resume()
         if self.state.decided is not None:

@@ -12,7 +12,8 @@ import torch
 from conftest import ring
 
 from mmsynth.errors import InputError
-from mmsynth.fitting.measurements import draw, draw_empty, load_measurements, measure
+from mmsynth.field import kernels
+from mmsynth.fitting.measurements import draw, empty_drawing_of, load_measurements, measure
 from mmsynth.fitting.needs import Needs, assess
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -82,7 +83,7 @@ def test_no_colour_outside_a_mask_is_ever_drawn(masks: MaskMeaning, tmp_path: Pa
 
 def test_empty_rays_go_through_pixels_outside(tmp_path: Path) -> None:
     measurements = load_measurements(_scene(tmp_path, "object"))
-    batch = draw_empty(measurements, {"rgb": 300, "mono": 500}, np.random.default_rng(0))
+    batch = kernels.draw(*empty_drawing_of(measurements, {"rgb": 300, "mono": 500}, np.random.default_rng(0)))
     assert batch.origins.shape == batch.directions.shape == (800, 3)
     # the disc is that of a ball around the origin: rays outside pass it
     inside = draw(measurements, None, {"mono": 500}, np.random.default_rng(0))

@@ -23,6 +23,7 @@ from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, s
 from mmsynth.field.kernels.parameters import (
     AdamStep,
     Cameras,
+    Drawing,
     Drawn,
     Eikonal,
     Frames,
@@ -55,6 +56,7 @@ __all__ = [
     "SOLID",
     "AdamStep",
     "Cameras",
+    "Drawing",
     "Drawn",
     "Eikonal",
     "Frames",
@@ -171,9 +173,13 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
 
 
-def learn(step: Step) -> Learned:
-    """A step's loss, and its gradients, added to ``grad`` of what is learned."""
-    return _backend(step.rays.origins).learn(step)
+def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
+    """A step's loss, and its gradients, added to ``grad`` of what is learned; beside it, two drawings at the most."""
+    backend = _backend(step.rays.origins)
+    if backend is cpu:
+        return cpu.learn(step, ahead)
+    learned: Learned = backend.learn(step)
+    return learned._replace(drawn=tuple(draw(*drawing) for drawing in ahead))
 
 
 def draw(

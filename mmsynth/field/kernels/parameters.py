@@ -6,6 +6,7 @@ Of what is drawn from: N modalities, F frames, C cameras, T tiles of frames, A a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from torch import Tensor
@@ -267,11 +268,12 @@ class Step(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Of a step: the loss, a scalar; squared (M,), residuals; samples, a number."""
+    """Of a step: the loss, a scalar; squared (M,), residuals; samples, a number; what was drawn beside it."""
 
     loss: Tensor
     squared: Tensor
     samples: Tensor
+    drawn: tuple[Drawn, ...] = ()
 
 
 class AdamStep(NamedTuple):
@@ -392,3 +394,14 @@ class Drawn(NamedTuple):
     tile: Tensor
     frame: Tensor
     measured: Measured
+
+
+class Drawing(NamedTuple):
+    """Photosites to draw, see ``drawing.draw``."""
+
+    frames: Frames
+    cameras: Cameras
+    modalities: Modalities
+    selection: Selection
+    rays: Sequence[int]
+    key: tuple[int, int]

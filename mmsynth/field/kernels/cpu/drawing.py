@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from itertools import accumulate
 
 import numpy as np
 import torch
 from numba import njit, prange
 
 from mmsynth.field.kernels.constants import DRAW_JITTER, DRAW_PIXEL, DRAW_TILE, PURPOSE_STRIDE, WORD
-from mmsynth.field.kernels.parameters import Cameras, Drawn, Frames, Measured, Modalities, Selection
+from mmsynth.field.kernels.parameters import Cameras, Drawing, Drawn, Frames, Measured, Modalities, Selection
 
-P = TypeVar("P", bound=tuple[Any, ...])
 CHUNK = 64  # rays
 _u, _f = np.uint32, np.float32
 _ZERO, _ONE, _TWO, _THREE, _SIX = _f(0.0), _f(1.0), _f(2.0), _f(3.0), _f(6.0)
@@ -108,85 +108,105 @@ def _in_camera(cameras, camera, row, column):  # type: ignore[no-untyped-def]
     return x / length, y / length, z / length
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def draw_rays(frames, cameras, modalities, selection, rays, key, drawn, measured):  # type: ignore[no-untyped-def]
-    """Fills ``drawn``, the first seven of ``Drawn``, and ``measured``; rays: (N,) int64, key: (2,) int64."""
+# parts of a drawing: its tables, rays (N,) and key (2,), the first seven of ``Drawn``, ``Measured``
+_ENDS = tuple(accumulate(len(kind._fields) for kind in (Frames, Cameras, Modalities, Selection)))
+_CAMERAS, _MODALITIES, _SELECTION, _RAYS = _ENDS
+_KEY, _DRAWN, _MEASURED = _RAYS + 1, _RAYS + 2, _RAYS + 9
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def drawing_tasks(drawing):  # type: ignore[no-untyped-def]
+    """How many there are."""
+    return (np.int64(drawing[_DRAWN].shape[0]) + CHUNK - 1) // CHUNK
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_chunk(chunk, drawing):  # type: ignore[no-untyped-def]
+    """A task: some of the rays. drawing: see ``to_draw``."""
+    frames, cameras = Frames(*drawing[:_CAMERAS]), Cameras(*drawing[_CAMERAS:_MODALITIES])
+    modalities, selection = Modalities(*drawing[_MODALITIES:_SELECTION]), Selection(*drawing[_SELECTION:_RAYS])
+    rays, key = drawing[_RAYS], drawing[_KEY]
     n_modalities, n_drawn = rays.shape[0], np.count_nonzero(rays)
     rays_end, numbers_end = np.cumsum(rays), np.cumsum(rays * modalities.values)
-    axes_begin = measured.target.shape[0] - measured.axes.shape[0]
-    out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame = drawn
-    target, of_ray, output, axes, level, saturation, weight = measured
-    count = out_jitter.shape[0]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        for ray in range(np.int64(chunk) * CHUNK, min(count, (np.int64(chunk) + 1) * CHUNK)):
-            n = _first_above(rays_end, 0, n_modalities - 1, ray)
-            tile = _first_above(
-                selection.ends, np.int64(modalities.first_tile[n]), np.int64(modalities.first_tile[n + 1]) - 1, _bits(key, ray, DRAW_TILE)
-            )
-            frame = _first_above(frames.first_tile, np.int64(modalities.first_frame[n]), np.int64(modalities.first_frame[n + 1]), tile) - 1
-            camera = frames.camera[frame]
-            width, tile_width = np.int64(cameras.width[camera]), np.int64(modalities.tile_width[n])
-            tile_height = np.int64(modalities.tile_height[n])
-            tiles_across, local = (width + tile_width - 1) // tile_width, tile - frames.first_tile[frame]
-            down, across = local // tiles_across, local % tiles_across
-            kth = (_bits(key, ray, DRAW_PIXEL) * np.int64(selection.pixels[tile])) >> 32
-            columns, first_word = min(tile_width, width - across * tile_width), selection.first_word[n]
-            if first_word >= 0:
-                per_tile = (tile_width * tile_height) // WORD
-                kth = _set_bit(selection.words, first_word + (tile - np.int64(modalities.first_tile[n])) * per_tile, kth)
-                columns = tile_width
-            row, column = down * tile_height + kth // columns, across * tile_width + kth % columns
+    out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame = drawing[_DRAWN:_MEASURED]
+    target, of_ray, output, axes, level, saturation, weight = drawing[_MEASURED:]
+    axes_begin = target.shape[0] - axes.shape[0]
+    for ray in range(chunk * CHUNK, min(out_jitter.shape[0], (chunk + 1) * CHUNK)):
+        n = _first_above(rays_end, 0, n_modalities - 1, ray)
+        tile = _first_above(
+            selection.ends, np.int64(modalities.first_tile[n]), np.int64(modalities.first_tile[n + 1]) - 1, _bits(key, ray, DRAW_TILE)
+        )
+        frame = _first_above(frames.first_tile, np.int64(modalities.first_frame[n]), np.int64(modalities.first_frame[n + 1]), tile) - 1
+        camera = frames.camera[frame]
+        width, tile_width = np.int64(cameras.width[camera]), np.int64(modalities.tile_width[n])
+        tile_height = np.int64(modalities.tile_height[n])
+        tiles_across, local = (width + tile_width - 1) // tile_width, tile - frames.first_tile[frame]
+        down, across = local // tiles_across, local % tiles_across
+        kth = (_bits(key, ray, DRAW_PIXEL) * np.int64(selection.pixels[tile])) >> 32
+        columns, first_word = min(tile_width, width - across * tile_width), selection.first_word[n]
+        if first_word >= 0:
+            per_tile = (tile_width * tile_height) // WORD
+            kth = _set_bit(selection.words, first_word + (tile - np.int64(modalities.first_tile[n])) * per_tile, kth)
+            columns = tile_width
+        row, column = down * tile_height + kth // columns, across * tile_width + kth % columns
 
-            x, y, z = _in_camera(cameras, camera, row, column)
-            turn, from_ = frames.rotation[frame], frames.origin[frame]
-            dx = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
-            dy = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
-            dz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
-            out_directions[ray, 0], out_directions[ray, 1], out_directions[ray, 2] = dx, dy, dz
-            out_origins[ray, 0], out_origins[ray, 1], out_origins[ray, 2] = from_[0], from_[1], from_[2]
-            out_jitter[ray] = _f(_bits(key, ray, DRAW_JITTER) >> 8) * _f(2.0**-24)
-            out_tile[ray] = tile
-            out_weight[ray] = selection.weight[tile]
+        x, y, z = _in_camera(cameras, camera, row, column)
+        turn, from_ = frames.rotation[frame], frames.origin[frame]
+        dx = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+        dy = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
+        dz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+        out_directions[ray, 0], out_directions[ray, 1], out_directions[ray, 2] = dx, dy, dz
+        out_origins[ray, 0], out_origins[ray, 1], out_origins[ray, 2] = from_[0], from_[1], from_[2]
+        out_jitter[ray] = _f(_bits(key, ray, DRAW_JITTER) >> 8) * _f(2.0**-24)
+        out_tile[ray] = tile
+        out_weight[ray] = selection.weight[tile]
 
-            values, kind, stride = np.int64(modalities.values[n]), frames.kind[frame], np.int64(frames.stride[frame])
-            at, alpha = frames.start[frame] + (row * width + column) * stride, _ONE
-            if stride > values:
-                alpha = _decoded(frames, kind, at + values)
-                out_alpha[ray] = alpha
-            else:
-                out_alpha[ray] = modalities.opaque[n]
-            mosaic, analyser = np.int64(modalities.pattern_first[n]), np.int64(modalities.analyser_first[n])
-            rays_begin, numbers_begin = rays_end[n] - rays[n], numbers_end[n] - rays[n] * values
-            share = out_weight[ray] / _f(n_drawn * rays[n] * values)
+        values, kind, stride = np.int64(modalities.values[n]), frames.kind[frame], np.int64(frames.stride[frame])
+        at, alpha = frames.start[frame] + (row * width + column) * stride, _ONE
+        if stride > values:
+            alpha = _decoded(frames, kind, at + values)
+            out_alpha[ray] = alpha
+        else:
+            out_alpha[ray] = modalities.opaque[n]
+        mosaic, analyser = np.int64(modalities.pattern_first[n]), np.int64(modalities.analyser_first[n])
+        rays_begin, numbers_begin = rays_end[n] - rays[n], numbers_end[n] - rays[n] * values
+        share = out_weight[ray] / _f(n_drawn * rays[n] * values)
+        if analyser >= 0:
+            along = turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz
+            rx, ry, rz = turn[0, 0] - along * dx, turn[1, 0] - along * dy, turn[2, 0] - along * dz
+            length = _f(math.sqrt(rx * rx + ry * ry + rz * rz))
+            rx, ry, rz = rx / length, ry / length, rz / length
+            ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
+        for j in range(values):
+            number = numbers_begin + (ray - rays_begin) * values + j
+            channel = np.int64(j)
+            if mosaic >= 0:
+                pattern_width = np.int64(modalities.pattern_width[n])
+                place = (row % np.int64(modalities.pattern_height[n])) * pattern_width + column % pattern_width
+                channel = np.int64(modalities.pattern[mosaic + place])
+            target[number] = _decoded(frames, kind, at + j) * alpha
+            of_ray[number] = ray
+            out_frame[number] = frame
+            level[number] = modalities.level[n]
+            saturation[number] = modalities.saturation[n]
+            weight[number] = share
+            output[number] = modalities.output[n]
             if analyser >= 0:
-                along = turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz
-                rx, ry, rz = turn[0, 0] - along * dx, turn[1, 0] - along * dy, turn[2, 0] - along * dz
-                length = _f(math.sqrt(rx * rx + ry * ry + rz * rz))
-                rx, ry, rz = rx / length, ry / length, rz / length
-                ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
-            for j in range(values):
-                number = numbers_begin + (ray - rays_begin) * values + j
-                channel = np.int64(j)
-                if mosaic >= 0:
-                    pattern_width = np.int64(modalities.pattern_width[n])
-                    place = (row % np.int64(modalities.pattern_height[n])) * pattern_width + column % pattern_width
-                    channel = np.int64(modalities.pattern[mosaic + place])
-                target[number] = _decoded(frames, kind, at + j) * alpha
-                of_ray[number] = ray
-                out_frame[number] = frame
-                level[number] = modalities.level[n]
-                saturation[number] = modalities.saturation[n]
-                weight[number] = share
-                output[number] = modalities.output[n]
-                if analyser >= 0:
-                    e, cos, sin = (
-                        number - axes_begin,
-                        modalities.analysers[analyser + channel, 0],
-                        modalities.analysers[analyser + channel, 1],
-                    )
-                    axes[e, 0], axes[e, 1], axes[e, 2] = cos * rx + sin * ux, cos * ry + sin * uy, cos * rz + sin * uz
-                else:
-                    output[number] += channel
+                e, cos, sin = (
+                    number - axes_begin,
+                    modalities.analysers[analyser + channel, 0],
+                    modalities.analysers[analyser + channel, 1],
+                )
+                axes[e, 0], axes[e, 1], axes[e, 2] = cos * rx + sin * ux, cos * ry + sin * uy, cos * rz + sin * uz
+            else:
+                output[number] += channel
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def draw_rays(drawing):  # type: ignore[no-untyped-def]
+    """Fills what is drawn."""
+    for chunk in prange(drawing_tasks(drawing)):
+        draw_chunk(np.int64(chunk), drawing)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -215,14 +235,10 @@ def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignor
             before = here
 
 
-def _arrays(table: P) -> P:
-    return type(table)(*(x.numpy() for x in table))
-
-
-def draw(
-    frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
-) -> Drawn:
-    """See ``drawing.draw``; float32."""
+def to_draw(drawing: Drawing) -> tuple[tuple[np.ndarray, ...], Drawn]:
+    """What kernels take, all arrays in one tuple (numba's parallel kernels take none of tuples), and what they fill."""
+    *tables, rays, key = drawing
+    modalities = drawing.modalities
     values = modalities.values.tolist()
     count, numbers = sum(rays), sum(r * k for r, k in zip(rays, values, strict=True))
     polarized = sum(r * k for r, k, a in zip(rays, values, modalities.analyser_first.tolist(), strict=True) if a >= 0)
@@ -231,9 +247,28 @@ def draw(
     measured = Measured(
         single(numbers), whole(numbers), whole(numbers), single(polarized, 3), single(numbers), single(numbers), single(numbers)
     )
-    tables = _arrays(frames), _arrays(cameras), _arrays(modalities), _arrays(selection)
-    draw_rays(*tables, np.array(rays), np.array(key), tuple(x.numpy() for x in drawn), _arrays(measured))
-    return Drawn(*drawn, measured)
+    told, filled = (x.numpy() for table in tables for x in table), (x.numpy() for x in (*drawn, *measured))
+    return (*told, np.array(rays, np.int64), np.array(key, np.int64), *filled), Drawn(*drawn, measured)
+
+
+@functools.cache
+def nothing_to_draw() -> tuple[np.ndarray, ...]:
+    """Of no frame."""
+    long, whole, single = (torch.empty(0, dtype=kind) for kind in (torch.int64, torch.int32, torch.float32))
+    stored = whole.view(torch.uint8), whole.view(torch.uint16), single
+    frames = Frames(long, whole, whole, whole, whole, single.view(0, 3, 3), single.view(0, 3), *stored)
+    cameras, selection = Cameras(whole, whole, long, whole, whole, single.view(0, 3)), Selection(long, single, whole, long, whole)
+    modalities = Modalities(*(whole,) * 10, single, single, single, whole, single.view(0, 2))  # type: ignore[call-arg]
+    return to_draw(Drawing(frames, cameras, modalities, selection, [], (0, 0)))[0]
+
+
+def draw(
+    frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
+) -> Drawn:
+    """See ``drawing.draw``; float32."""
+    arrays, drawn = to_draw(Drawing(frames, cameras, modalities, selection, rays, key))
+    draw_rays(arrays)
+    return drawn
 
 
 def odds(residual: torch.Tensor, count: torch.Tensor, first_tile: torch.Tensor, evenly: float) -> tuple[torch.Tensor, torch.Tensor]:

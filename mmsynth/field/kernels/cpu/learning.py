@@ -15,6 +15,7 @@ from numba import njit, prange
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
 from mmsynth.field.kernels.cpu.blocks import scatter_block
+from mmsynth.field.kernels.cpu.drawing import draw_chunk, drawing_tasks
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
 from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backward, see_mirrors
 from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
@@ -150,9 +151,10 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _work(  # type: ignore[no-untyped-def]
     worker, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
-    measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
+    g_gain,
 ):  # fmt: skip
-    """Take chunks of rays, and then points, until there are none."""
+    """Take chunks of rays, then points, and then rays of the next step to draw, until there are none."""
     total, points = rays.origins.shape[0], eikonal.points.shape[0]
     chunks = (total + CHUNK - 1) // CHUNK
     asked = points + (total if len(lamps.position) else len(eikonal.noise))
@@ -167,30 +169,38 @@ def _work(  # type: ignore[no-untyped-def]
             )  # fmt: skip
             continue
         begin = (chunk - chunks) * POINTS
-        if begin >= points:
+        if begin < points:
+            factor = eikonal.weight / _f(max(asked, 1))
+            out.loss[chunk] = learn_points(
+                chunk, np.int64(min(POINTS, points - begin)), eikonal.points, begin, eikonal, factor, grid, surface, scratch, worker, taps
+            )
+            continue
+        task, first = chunk - chunks - (points + POINTS - 1) // POINTS, drawing_tasks(ahead)
+        if task < first:
+            draw_chunk(task, ahead)
+        elif task - first < drawing_tasks(ahead_too):
+            draw_chunk(task - first, ahead_too)
+        else:
             return
-        factor = eikonal.weight / _f(max(asked, 1))
-        out.loss[chunk] = learn_points(
-            chunk, np.int64(min(POINTS, points - begin)), eikonal.points, begin, eikonal, factor, grid, surface, scratch, worker, taps
-        )
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def learn_rays(  # type: ignore[no-untyped-def]
     threads, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
-    measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
+    g_gain,
 ):  # fmt: skip
     """See ``learning.learn``: all but the gradients of the tables, which ``learn_tables`` adds up.
 
     surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
-    there are. lamps: those. gain, mirrored: (M,), empty where there are none.
+    there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: see ``to_draw``.
     """
     next_task[0] = 0
     for worker in prange(threads):
         _work(
             np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps,
-            far_light, view, measured, gain, opacities, eikonal, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
-            g_mirrored, g_gain,
+            far_light, view, measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples,
+            squared, mirrored, g_mirrored, g_gain,
         )  # fmt: skip
 
 

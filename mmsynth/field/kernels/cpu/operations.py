@@ -7,6 +7,7 @@ follows autograd's rules.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.blocks import surface_layers
+from mmsynth.field.kernels.cpu.drawing import nothing_to_draw, to_draw
 from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.matrices import padded
@@ -37,6 +39,7 @@ from mmsynth.field.kernels.cpu.stores import (
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.learning import gradient_of
 from mmsynth.field.kernels.parameters import (
+    Drawing,
     GridTable,
     Hits,
     Lamps,
@@ -304,8 +307,8 @@ class _Mirror(torch.autograd.Function):
 
 
 @torch.no_grad()
-def learn(step: Step) -> Learned:
-    """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
+def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
+    """See ``learning.learn``; float32, ``measured.ray`` never decreasing. Beside it, two drawings at the most."""
     grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), get_num_threads()
@@ -329,12 +332,14 @@ def learn(step: Step) -> Learned:
     squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
     g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
     next_task = np.zeros(1, np.int64)
+    to_fill = [to_draw(drawing) for drawing in ahead]
+    first, second = (*(arrays for arrays, _ in to_fill), nothing_to_draw(), nothing_to_draw())[:2]
     table, look = _arrays(grid), _arrays(appearance)
     learning.learn_rays(
         threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, surface_layers(_arrays(network)), look,
         *_shader_layers(_arrays(shader)), two_layers(*shining[:4]), lamps, _array(far_light), _arrays(view), _arrays(measured), gain,
-        _arrays(opacities), _arrays(eikonal), store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays, out.arrays, samples,
-        squared, mirrored, g_mirrored, g_gain,
+        _arrays(opacities), _arrays(eikonal), first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays,
+        out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
     gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
     learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
@@ -358,7 +363,7 @@ def learn(step: Step) -> Learned:
         by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
         _add_gradient(gains.log_gain, (by_frame - by_frame.mean()).astype(np.float32))
     loss = torch.tensor(found.loss[:tasks].sum(), dtype=torch.float32)
-    return Learned(loss, torch.from_numpy(squared), torch.tensor(samples.sum()))
+    return Learned(loss, torch.from_numpy(squared), torch.tensor(samples.sum()), tuple(drawn for _, drawn in to_fill))
 
 
 def _add_gradient(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray | None = None) -> None:

@@ -52,20 +52,26 @@ def _at(typingctx, address, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _take_parts(next_task, places, numbers):  # type: ignore[no-untyped-def]
+    tensor, before = 0, 0  # tasks of the tensors before
     while True:
         task = take(next_task, 0)
-        if task >= len(places):
+        while tensor < len(places) and (task - before) * ADAM_CHUNK >= places[tensor, 4]:
+            before += (places[tensor, 4] + ADAM_CHUNK - 1) // ADAM_CHUNK
+            tensor += 1
+        if tensor == len(places):
             return
-        count = places[task, 4]
-        p, g, m, v = _at(places[task, 0], count), _at(places[task, 1], count), _at(places[task, 2], count), _at(places[task, 3], count)
-        rate, beta1, beta2, root, epsilon = numbers[task]
-        adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon, places[task, 5] != 0)
+        begin = (task - before) * ADAM_CHUNK
+        count, at = min(ADAM_CHUNK, places[tensor, 4] - begin), 4 * begin
+        p, g = _at(places[tensor, 0] + at, count), _at(places[tensor, 1] + at, count)
+        m, v = _at(places[tensor, 2] + at, count), _at(places[tensor, 3] + at, count)
+        rate, beta1, beta2, root, epsilon = numbers[tensor]
+        adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon, places[tensor, 5] != 0)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def adam_parts(threads, next_task, places, numbers):  # type: ignore[no-untyped-def]
-    """``adam_part`` of many tensors, in parts. places: (N, 6) addresses of parameters, gradients and moments, how many, whether sparse;
-    numbers: N tuples of the others."""
+    """``adam_part`` of N tensors. places: (N, 6) addresses of parameters, gradients and moments, how many, whether sparse; numbers: (N, 5),
+    the others."""
     next_task[0] = 0
     for _ in prange(threads):
         _take_parts(next_task, places, numbers)
@@ -84,11 +90,7 @@ def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, ste
 
 def adam_together(parts: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, AdamStep]]) -> None:
     """``adam`` of many tensors at once; float32, contiguous."""
-    places, numbers = [], []
-    for *tensors, step in parts:
-        addresses, count, of_step = [x.data_ptr() for x in tensors], tensors[0].numel(), _numbers(step)
-        for begin in range(0, count, ADAM_CHUNK):
-            places.append((*(a + 4 * begin for a in addresses), min(ADAM_CHUNK, count - begin), step.sparse))
-            numbers.append(of_step)
-    if places:
+    if parts:
+        places = [(*(x.data_ptr() for x in tensors), tensors[0].numel(), step.sparse) for *tensors, step in parts]
+        numbers = [_numbers(part[4]) for part in parts]
         adam_parts(get_num_threads(), np.zeros(1, np.int64), np.array(places, np.int64), np.array(numbers, np.float32))

@@ -19,6 +19,7 @@ from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
 _POOLED = 12
+_SPARE = 4  # times the slots that are needed: larger arrays are let go
 _TAPS = 4 * MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
 _pool: list[tuple[Any, Any]] = []
 
@@ -89,17 +90,18 @@ class Store(Generic[S]):
 
     def __init__(self, slots: int, kind: Callable[..., S], sizes: Sizes) -> None:
         self.key = kind, tuple(sizes.items())
+        slots = 1 << max(slots - 1, 3).bit_length()
         for index, (key, arrays) in enumerate(_pool):
-            if key == self.key and len(arrays[0]) >= slots:
+            if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots:
                 self.arrays = _pool.pop(index)[1]
                 return
-        slots = 1 << max(slots - 1, 3).bit_length()
-        _pool[:] = [(key, arrays) for key, arrays in _pool if key != self.key]  # too few slots, and needs grow
+        _pool[:] = [(key, arrays) for key, arrays in _pool if key != self.key]  # too few slots, and needs grow; or far too many
         self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes.items()})
 
     def __del__(self) -> None:
-        if len(_pool) < _POOLED and hasattr(self, "arrays"):  # none where memory lacked for them
+        if hasattr(self, "arrays"):  # none where memory lacked for them
             _pool.append((self.key, self.arrays))
+            del _pool[:-_POOLED]  # what was not asked for for long
 
 
 def _tiles(count: int) -> int:

@@ -1,0 +1,46 @@
+"""What a step draws. It is drawn beside the kernels of the step before, so that no core waits for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from mmsynth.field import kernels, rendering
+from mmsynth.field.field import Field
+from mmsynth.fitting.measurements import Batch, Measurements, batch_of
+
+
+@dataclass(frozen=True)
+class ToDraw:
+    """Rays of a step.
+
+    Attributes:
+        rays: how many of each modality. drawings: of the photosites that are learned from, and of those outside of masks, if there are any.
+        generator: the random numbers of what else is due in the step.
+    """
+
+    rays: dict[str, int]
+    drawings: tuple[kernels.Drawing, ...]
+    generator: torch.Generator
+
+
+@dataclass(frozen=True)
+class DrawnStep:
+    """A batch, and its rays with those outside of masks after them."""
+
+    batch: Batch
+    rays: kernels.Rays
+    generator: torch.Generator
+
+
+def drawn_step(field: Field, measurements: Measurements, asked: ToDraw, drawn: Sequence[kernels.Drawn]) -> DrawnStep:
+    """What was drawn as a step takes it."""
+    batch = batch_of(measurements, asked.rays, drawn[0])
+    origins, directions, jitter = batch.origins, batch.directions, batch.jitter
+    for more in drawn[1:]:
+        origins, directions = torch.cat([origins, more.origins]), torch.cat([directions, more.directions])
+        jitter = torch.cat([jitter, more.jitter])
+    near, far = rendering.interval(field.surface, origins, directions)
+    return DrawnStep(batch, kernels.Rays(origins, directions, near, far, jitter), asked.generator)
