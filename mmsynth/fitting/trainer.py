@@ -296,12 +296,13 @@ class Trainer:
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
-        out, residuals = {}, []
+        out, relative = {}, np.empty(len(batch.origins), np.float32)
+        of_numbers, weight = squared.numpy(), batch.ray_weight.numpy()
         for name, (rays, numbers) in batch.parts.items():
-            found = squared[numbers].reshape(rays.stop - rays.start, -1).mean(1)
-            out[name] = float((batch.ray_weight[rays] * found).mean())
-            residuals.append(found.sqrt() / self.measurements[name].radiance_scale)
-        self.importance.learn(batch.tile, torch.cat(residuals))
+            found = of_numbers[numbers].reshape(rays.stop - rays.start, -1).mean(1)
+            out[name] = float(weight[rays] @ found) / len(found)
+            relative[rays] = np.sqrt(found) / self.measurements[name].radiance_scale
+        self.importance.learn(batch.tile, torch.from_numpy(relative))
         return out
 
     @property

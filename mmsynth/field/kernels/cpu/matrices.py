@@ -107,6 +107,20 @@ def clear(out, rows, columns):  # type: ignore[no-untyped-def]
             out[i, j] = np.float32(0.0)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_sum(parts, out):  # type: ignore[no-untyped-def]
+    """out += the sum of matrices (N, ≥ rows, ≥ columns) in their order."""
+    rows, columns = out.shape
+    total = np.empty(columns, np.float32)
+    for i in range(rows):
+        total[:] = np.float32(0.0)
+        for n in range(parts.shape[0]):
+            for j in range(columns):
+                total[j] += parts[n, i, j]
+        for j in range(columns):
+            out[i, j] += total[j]
+
+
 @njit(cache=True, inline="always", error_model="numpy")
 def whole(count, of):  # type: ignore[no-untyped-def]
     """``count`` rounded up to a multiple."""

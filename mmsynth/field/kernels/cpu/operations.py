@@ -22,7 +22,7 @@ from mmsynth.field.kernels.cpu.blocks import surface_layers
 from mmsynth.field.kernels.cpu.drawing import nothing_to_draw, to_draw
 from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CHUNK
-from mmsynth.field.kernels.cpu.matrices import padded
+from mmsynth.field.kernels.cpu.matrices import add_sum, padded
 from mmsynth.field.kernels.cpu.shading import Layers, two_layers
 from mmsynth.field.kernels.cpu.slopes import TapStore
 from mmsynth.field.kernels.cpu.stores import (
@@ -343,33 +343,37 @@ def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
     )  # fmt: skip
     gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
     learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
+    inner, outer = gradient_of(network.hidden).numpy().T, gradient_of(network.output).numpy()
     for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
-        for weight, gradient in zip((network.hidden, network.output), _of_weights(arrays, parts, network.hidden), strict=True):
-            _add_gradient(weight, gradient)
+        add_sum(arrays.turned_out[:parts], inner)
+        _add(arrays.output_out[:parts, :units], outer[:-1])
+        _add(arrays.output_out[:parts, -1:], outer[-1:])
     for name, weight in shader._asdict().items():
-        whole = getattr(weights.arrays, f"{name}_out")[:chunks].sum(0)
-        _add_gradient(weight, whole[tuple(slice(n) for n in weight.shape)])
+        _add(getattr(weights.arrays, f"{name}_out")[:chunks], gradient_of(weight).numpy())
     found = out.arrays
     if len(used):
-        _add_gradient(light.first, found.first[:chunks].sum(0)[:hidden, :features])
-        _add_gradient(light.first_bias, found.first_bias[:chunks].sum(0)[:hidden])
-        _add_gradient(light.second, found.second[:chunks].sum(0)[: len(columns), :hidden], columns)
-        _add_gradient(light.second_bias, found.second_bias[:chunks].sum(0), columns)
-        _add_gradient(light.position, found.position[:chunks].sum(0), used)
-        _add_gradient(light.log_spectrum, found.spectrum[:chunks].sum(0) * lamps.spectrum, used)
+        _add(found.first[:chunks], gradient_of(light.first).numpy())
+        _add(found.first_bias[:chunks], gradient_of(light.first_bias).numpy())
+        _add_rows(light.second, found.second[:chunks].sum(0)[: len(columns), :hidden], columns)
+        _add_rows(light.second_bias, found.second_bias[:chunks].sum(0), columns)
+        _add_rows(light.position, found.position[:chunks].sum(0), used)
+        _add_rows(light.log_spectrum, found.spectrum[:chunks].sum(0) * lamps.spectrum, used)
     if len(far_light):
-        _add_gradient(far_light, found.far[:chunks].sum(0))
+        _add(found.far[:chunks], gradient_of(far_light).numpy())
     if len(gain):
         by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
-        _add_gradient(gains.log_gain, (by_frame - by_frame.mean()).astype(np.float32))
+        gradient_of(gains.log_gain).numpy()[...] += (by_frame - by_frame.mean()).astype(np.float32)
     loss = torch.tensor(found.loss[:tasks].sum(), dtype=torch.float32)
     return Learned(loss, torch.from_numpy(squared), torch.tensor(samples.sum()), tuple(drawn for _, drawn in to_fill))
 
 
-def _add_gradient(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray | None = None) -> None:
-    """To ``tensor.grad``, or some of its rows."""
-    grad = gradient_of(tensor).numpy()
-    if rows is None:
-        grad += gradient
-    else:
-        grad[rows] += gradient
+def _add(parts: np.ndarray, gradient: np.ndarray) -> None:
+    """See ``add_sum``; of vectors, too."""
+    if gradient.ndim == 1:
+        parts, gradient = parts[:, None], gradient[None]
+    add_sum(parts, gradient)
+
+
+def _add_rows(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray) -> None:
+    """To some rows of ``tensor.grad``."""
+    gradient_of(tensor).numpy()[rows] += gradient
