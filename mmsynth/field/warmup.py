@@ -30,6 +30,7 @@ def warm_up() -> None:
         print("compiling kernels once, about a minute ...", file=sys.stderr, flush=True)
         command = [sys.executable, "-c", "from mmsynth.field.warmup import run_kernels; run_kernels()"]
         subprocess.run(command, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True)
+        cpu.remove_old_kernels()
     run_kernels()
 
 

@@ -280,7 +280,9 @@ class Trainer:
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
         outside = len(rays.origins) - len(trains)
-        view = kernels.View(*(pad(x, (0, outside), value=y) for x, y in ((batch.per_ray(field.view_dependence), 0), (trains, True))))
+        degrees = batch.per_ray(field.view_dependence)
+        if outside:
+            degrees, trains = pad(degrees, (0, outside)), pad(trains, (0, outside), value=True)
         light = field.light.network() if field.light is not None and field.shines else kernels.no_light(self.device)
         # light from beyond the region would explain what is in it as long as that has no shape
         none = rays.origins.new_empty(0)
@@ -288,7 +290,8 @@ class Trainer:
         log_gain = self.log_gain if self._has_gains else none
         step = kernels.Step(
             *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
-            field.shader.weights(), light, far_light, rays, view, batch.measured, kernels.Gains(log_gain, batch.frame),
+            field.shader.weights(), light, far_light, rays, kernels.View(degrees, trains), batch.measured,
+            kernels.Gains(log_gain, batch.frame),
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
             eikonal(field, sampling, self.recipe, self.progress, drawn.generator), sampling,
         )  # fmt: skip
@@ -299,8 +302,10 @@ class Trainer:
         out, relative = {}, np.empty(len(batch.origins), np.float32)
         of_numbers, weight = squared.numpy(), batch.ray_weight.numpy()
         for name, (rays, numbers) in batch.parts.items():
-            found = of_numbers[numbers].reshape(rays.stop - rays.start, -1).mean(1)
-            out[name] = float(weight[rays] @ found) / len(found)
+            found, count = of_numbers[numbers], rays.stop - rays.start
+            if len(found) > count:
+                found = found.reshape(count, -1).mean(1)
+            out[name] = float(weight[rays] @ found) / count
             relative[rays] = np.sqrt(found) / self.measurements[name].radiance_scale
         self.importance.learn(batch.tile, torch.from_numpy(relative))
         return out

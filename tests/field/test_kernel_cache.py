@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numba
@@ -41,6 +42,14 @@ def test_each_version_has_its_folder_and_other_code_keeps_its_own(tmp_path: Path
     monkeypatch.setattr(caching.os, "access", lambda *_: False)
     with caching.kept_by_version(folder):
         assert tmp_path not in Path(numba.config.CACHE_DIR).parents and "mmsynth" in numba.config.CACHE_DIR
+
+
+def test_the_last_versions_are_kept(tmp_path: Path) -> None:
+    for age, name in enumerate(("kernels-now", "kernels-a", "kernels-b", "kernels-c", "other")):
+        (tmp_path / name / "cpu").mkdir(parents=True)
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    caching.remove_old_versions(tmp_path / "kernels-now")
+    assert {path.name for path in tmp_path.iterdir()} == {"kernels-now", "kernels-a", "kernels-b", "other"}
 
 
 def test_the_kernels_are_kept_by_version() -> None:

@@ -159,6 +159,24 @@ def test_nothing_is_stored_where_no_gradient_can_be_asked_for(monkeypatch: pytes
     assert slots[2:] == [-(-600 // CHUNK)]
 
 
+def test_stores_are_used_again_and_let_go_when_far_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stores, "_pool", pool := [])
+    first = stores.tap_store(4, 8, 2)
+    block = first.arrays.block
+    del first
+    again = stores.tap_store(3, 8, 2)
+    assert again.arrays.block is block and not pool
+    del again
+    large = stores.tap_store(40, 8, 2)
+    assert len(large.arrays.block) >= 40 and not pool  # one of the kind: needs grow
+    del large
+    small = stores.tap_store(4, 8, 2)
+    assert len(small.arrays.block) == 4 and not pool  # that of a call that needed ten times as much is let go
+    for levels in range(1, 30):
+        stores.tap_store(4, 8, levels)
+    assert len(pool) <= 12
+
+
 def test_hidden_units_come_in_fours() -> None:
     """The kernels take four at a time; they would read past the end of a fifth."""
     with pytest.raises(ValueError, match="multiple of 4"):

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 import torch
+from test_drawing import _scene, _selection
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import learning
-from mmsynth.field.kernels.learning import learn
 from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
@@ -74,7 +75,7 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
     }
 
 
-def _run(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Learned, dict[str, Tensor]]:
+def _run(step: dict[str, Any], dtype: torch.dtype, *ahead: Sequence[kernels.Drawing]) -> tuple[kernels.Learned, dict[str, Tensor]]:
     """What was learned, and all gradients by name."""
     modules = {n: m.to(dtype) for n, m in step.items() if isinstance(m, nn.Module)}
     for m in modules.values():
@@ -88,7 +89,7 @@ def _run(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Learned, dic
         tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
         tuples["eikonal"], step["sampling"],
     )  # fmt: skip
-    found = (kernels.learn if dtype == torch.float32 else learn)(told)
+    found = (kernels.learn if dtype == torch.float32 or ahead else learning.learn)(told, *ahead)
     parameters = {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
     return found, {n: p.grad.clone() for n, p in parameters.items() if p.grad is not None and p.numel()}
 
@@ -130,6 +131,23 @@ def test_sums_do_not_depend_on_threads() -> None:
         numba.set_num_threads(before)
     assert results[0][0].loss == results[1][0].loss
     assert all(torch.equal(g, results[1][1][n]) for n, g in results[0][1].items())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_rays_of_the_next_step_are_drawn_beside_it(dtype: torch.dtype, count: int) -> None:
+    """The same rays as alone, and the step is the same."""
+    step, tables = _step(*CASES["lamps"]), _scene()
+    asked = [([500, 300, 200], (7, 8)), ([100, 0, 65], (2**32 - 1, 9))][:count]
+    drawings = [kernels.Drawing(*tables, _selection(n, 0.3)[0], rays, key) for n, (rays, key) in enumerate(asked)]
+    (alone, expected), (found, gradients) = _run(step, dtype), _run(step, dtype, drawings)
+    assert found.loss == alone.loss and torch.equal(found.squared, alone.squared)
+    assert all(torch.equal(g, expected[n]) for n, g in gradients.items())
+    assert len(found.drawn) == count
+    for ours, drawing in zip(found.drawn, drawings, strict=True):
+        theirs = kernels.draw(*drawing)
+        for one, other in zip((*ours[:-1], *ours.measured), (*theirs[:-1], *theirs.measured), strict=True):
+            assert torch.equal(one.nan_to_num(-1.0), other.nan_to_num(-1.0))
 
 
 def test_far_light_is_what_a_ray_without_surface_shows() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Callable
@@ -19,8 +20,10 @@ from mmsynth.errors import DivergedError, InputError, Interrupted
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import SHELL
+from mmsynth.field.rendering import interval
 from mmsynth.field.storage import load_field
 from mmsynth.fitting import run as run_module
+from mmsynth.fitting.ahead import DrawnStep
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.device import pick_device
 from mmsynth.fitting.measurements import draw, load_measurements
@@ -169,6 +172,23 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, de
     same = ("exposure", "recipe", "seed", "steps", "train_psnr", "skipped_steps", "grid_reopened")
     assert {k: resumed.manifest[k] for k in same} == {k: whole.manifest[k] for k in same}
     assert resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
+
+
+def test_a_fit_goes_on_anywhere_with_the_rays_that_were_drawn_ahead(scene: Scene) -> None:
+    """Poses move, and it is chosen anew where rays go, between the drawing of rays and the step that learns from them."""
+    changes = {"poses.views": "on", "poses.start_at": 0.3, "sampling.occupancy_every": 8}
+    trainer, saved = _trainer(scene, 40, **changes), {}
+    while trainer.progress < 1.0:
+        trainer.run_step()
+        saved[trainer.state.step] = copy.deepcopy(trainer.checkpoint())
+    assert trainer.refinement.steps > 0 and trainer.refinement.motions.views.any()
+    for step in (1, 11, 12, 13, 15, 16, 17, 31, 32, 39):
+        other = _trainer(scene, 40, **changes)
+        other.restore(saved[step])
+        while other.progress < 1.0:
+            other.run_step()
+        expected = _tensors(trainer.field)
+        assert all(torch.equal(value, expected[name]) for name, value in _tensors(other.field).items()), step
 
 
 def test_a_fit_that_is_looked_at_comes_to_the_same_field(scene: Scene, tmp_path: Path) -> None:
@@ -388,7 +408,12 @@ def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -
 def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     trainer.recipe = _recipe(**changes)
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
-    return float(trainer._learn(batch, sampling, np.random.default_rng(0), torch.Generator().manual_seed(0)).loss)
+    drawn = DrawnStep(batch, _rays(trainer, batch), torch.Generator().manual_seed(0))
+    return float(trainer._learn(drawn, sampling, ()).loss)
+
+
+def _rays(trainer: Trainer, batch: Any) -> kernels.Rays:
+    return kernels.Rays(batch.origins, batch.directions, *interval(trainer.field.surface, batch.origins, batch.directions), batch.jitter)
 
 
 @torch.no_grad()

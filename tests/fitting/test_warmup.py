@@ -9,7 +9,18 @@ from numba.core.dispatcher import Dispatcher
 
 from mmsynth.field import warmup
 from mmsynth.field.kernels import cpu
-from mmsynth.field.kernels.cpu import blocks, drawing, marching, mirroring, optimiser, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import (
+    blocks,
+    drawing,
+    learning,
+    marching,
+    matrices,
+    mirroring,
+    optimiser,
+    shading,
+    surface,
+    tracing_gradients,
+)
 from mmsynth.field.warmup import warm_up
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -18,7 +29,7 @@ from mmsynth.scene.load import load_scene
 
 
 def _signatures() -> dict[str, list[object]]:
-    modules = (blocks, drawing, marching, mirroring, optimiser, shading, surface, tracing_gradients)
+    modules = (blocks, drawing, learning, marching, matrices, mirroring, optimiser, shading, surface, tracing_gradients)
     return {f"{m.__name__}.{n}": list(x.signatures) for m in modules for n, x in vars(m).items() if isinstance(x, Dispatcher)}
 
 

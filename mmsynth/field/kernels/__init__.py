@@ -16,7 +16,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from mmsynth.field.kernels import cpu, reference
+from mmsynth.field.kernels import cpu, learning, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.learning import no_light
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
@@ -178,7 +178,7 @@ def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
     backend = _backend(step.rays.origins)
     if backend is cpu:
         return cpu.learn(step, ahead)
-    learned: Learned = backend.learn(step)
+    learned: Learned = learning.learn(step) if backend is reference else backend.learn(step)
     return learned._replace(drawn=tuple(draw(*drawing) for drawing in ahead))
 
 

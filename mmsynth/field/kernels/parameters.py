@@ -1,4 +1,5 @@
-"""What the operations take, as tuples of tensors and numbers. The back ends hand them on as they are; numba compiles for their types.
+"""What the operations take, as tuples of tensors and numbers, in one file. The back ends hand them on as they are; numba compiles for their
+types.
 
 Symbols: R rays, M measured numbers, L levels of a grid, T rows of its table, F features per level, H units of a hidden layer.
 Of what is drawn from: N modalities, F frames, C cameras, T tiles of frames, A analysers; whole numbers are int32 unless said otherwise.

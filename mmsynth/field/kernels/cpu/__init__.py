@@ -9,7 +9,7 @@ from pathlib import Path
 from mmsynth.field.kernels.cpu.caching import kept_by_version
 
 with kept_by_version(Path(__file__).parent):
-    from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled
+    from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled, remove_old_kernels
     from mmsynth.field.kernels.cpu.drawing import draw, odds
     from mmsynth.field.kernels.cpu.operations import compare, learn, mirror, shade, surface_value, trace
     from mmsynth.field.kernels.cpu.optimiser import adam, adam_together
@@ -18,5 +18,5 @@ from mmsynth.field.kernels.reference import hash_encode, march, section_weights
 
 __all__ = [
     "KERNELS", "adam", "adam_together", "compare", "draw", "hash_encode", "is_compiled", "learn", "march", "mirror", "odds",
-    "section_weights", "shade", "surface_value", "trace",
+    "remove_old_kernels", "section_weights", "shade", "surface_value", "trace",
 ]  # fmt: skip

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,16 @@ def version_of_sources(folder: Path) -> str:
     for path in sorted([*folder.glob("*.py"), *folder.parent.glob("*.py")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+_VERSIONS = 3  # kept beside each other: those of other trees that share the folder, and of the last change taken back
+
+
+def remove_old_versions(folder: Path) -> None:
+    """Leave the last few versions beside this one, the folder of its kernels."""
+    versions = [path for path in folder.parent.glob("kernels-*") if path != folder and path.is_dir()]
+    for path in sorted(versions, key=lambda path: path.stat().st_mtime, reverse=True)[_VERSIONS - 1 :]:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, optimiser, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.caching import remove_old_versions
 
 KERNELS = (
     surface.surface_forward, surface.surface_backward, surface.surface_scatter,
@@ -18,6 +19,11 @@ KERNELS = (
 def is_compiled() -> bool:
     """Whether every kernel has code for its usual types, in this process or in the cache on disk."""
     return all(k.signatures or _cached(k) for k in KERNELS)
+
+
+def remove_old_kernels() -> None:
+    """Of versions before the last few."""
+    remove_old_versions(Path(KERNELS[0]._cache._cache_path).parent)
 
 
 def _cached(kernel: Any) -> bool:

@@ -70,7 +70,7 @@ class TraceOutputs(NamedTuple):
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
+    return (tensor if tensor.is_contiguous() else tensor.contiguous()).numpy(force=True)
 
 
 def _arrays(parameters: P) -> P:
@@ -346,18 +346,23 @@ def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
     inner, outer = gradient_of(network.hidden).numpy().T, gradient_of(network.output).numpy()
     for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
         add_sum(arrays.turned_out[:parts], inner)
-        _add(arrays.output_out[:parts, :units], outer[:-1])
-        _add(arrays.output_out[:parts, -1:], outer[-1:])
+        padded_outer = np.zeros(arrays.output_out.shape[1], np.float32)
+        _add(arrays.output_out[:parts], padded_outer)
+        outer += np.append(padded_outer[:units], padded_outer[-1])
     for name, weight in shader._asdict().items():
         _add(getattr(weights.arrays, f"{name}_out")[:chunks], gradient_of(weight).numpy())
     found = out.arrays
     if len(used):
         _add(found.first[:chunks], gradient_of(light.first).numpy())
         _add(found.first_bias[:chunks], gradient_of(light.first_bias).numpy())
-        _add_rows(light.second, found.second[:chunks].sum(0)[: len(columns), :hidden], columns)
-        _add_rows(light.second_bias, found.second_bias[:chunks].sum(0), columns)
-        _add_rows(light.position, found.position[:chunks].sum(0), used)
-        _add_rows(light.log_spectrum, found.spectrum[:chunks].sum(0) * lamps.spectrum, used)
+        one = np.float32(1.0)
+        for weight, rows, of_chunks, factor in (
+            (light.second, columns, found.second, one), (light.second_bias, columns, found.second_bias, one),
+            (light.position, used, found.position, one), (light.log_spectrum, used, found.spectrum, lamps.spectrum),
+        ):  # fmt: skip
+            of_rows = np.zeros((len(rows), *weight.shape[1:]), np.float32)
+            _add(of_chunks[:chunks], of_rows)
+            gradient_of(weight).numpy()[rows] += factor * of_rows
     if len(far_light):
         _add(found.far[:chunks], gradient_of(far_light).numpy())
     if len(gain):
@@ -372,8 +377,3 @@ def _add(parts: np.ndarray, gradient: np.ndarray) -> None:
     if gradient.ndim == 1:
         parts, gradient = parts[:, None], gradient[None]
     add_sum(parts, gradient)
-
-
-def _add_rows(tensor: Tensor, gradient: np.ndarray, rows: np.ndarray) -> None:
-    """To some rows of ``tensor.grad``."""
-    gradient_of(tensor).numpy()[rows] += gradient

@@ -77,10 +77,9 @@ def adam_parts(threads, next_task, places, numbers):  # type: ignore[no-untyped-
         _take_parts(next_task, places, numbers)
 
 
-def _numbers(step: AdamStep) -> tuple[np.float32, ...]:
-    f = np.float32
-    root = f(1 / math.sqrt(1 - step.beta2**step.number))
-    return f(step.rate / (1 - step.beta1**step.number)), f(step.beta1), f(step.beta2), root, f(step.epsilon)
+def _numbers(step: AdamStep) -> tuple[float, ...]:
+    root = 1 / math.sqrt(1 - step.beta2**step.number)
+    return step.rate / (1 - step.beta1**step.number), step.beta1, step.beta2, root, step.epsilon
 
 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -81,6 +82,7 @@ class ShadingStore(NamedTuple):
 
 
 Sizes = dict[str, tuple[type, tuple[int, ...]]]  # by name: dtype and shape of one slot
+Key = tuple[tuple[str, tuple[type, tuple[int, ...]]], ...]  # the same, as what is looked for
 
 
 class Store(Generic[S]):
@@ -88,15 +90,15 @@ class Store(Generic[S]):
 
     arrays: S
 
-    def __init__(self, slots: int, kind: Callable[..., S], sizes: Sizes) -> None:
-        self.key = kind, tuple(sizes.items())
+    def __init__(self, slots: int, kind: Callable[..., S], sizes: Key) -> None:
+        self.key = kind, sizes
         slots = 1 << max(slots - 1, 3).bit_length()
         for index, (key, arrays) in enumerate(_pool):
             if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots:
                 self.arrays = _pool.pop(index)[1]
                 return
         _pool[:] = [(key, arrays) for key, arrays in _pool if key != self.key]  # too few slots, and needs grow; or far too many
-        self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes.items()})
+        self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
 
     def __del__(self) -> None:
         if hasattr(self, "arrays"):  # none where memory lacked for them
@@ -116,11 +118,21 @@ def _network(rows: int, units: int, levels: int) -> Sizes:
 
 def surface_store(slots: int, units: int, levels: int) -> Store[SurfaceStore]:
     """Of a surface of so many hidden units and levels."""
-    return Store(slots, SurfaceStore, _network(POINTS, units, levels))
+    return Store(slots, SurfaceStore, _surface_sizes(units, levels))
+
+
+@functools.cache
+def _surface_sizes(units: int, levels: int) -> Key:
+    return tuple(_network(POINTS, units, levels).items())
 
 
 def ray_store(slots: int, units: int, levels: int, appearance_levels: int) -> Store[RayStore]:
     """The same, of rays with an appearance."""
+    return Store(slots, RayStore, _ray_sizes(units, levels, appearance_levels))
+
+
+@functools.cache
+def _ray_sizes(units: int, levels: int, appearance_levels: int) -> Key:
     f, i, d, most = np.float32, np.int32, np.float64, CAPACITY
     lengths: dict[str, tuple[type, int]] = {
         "sdf": (f, most), "ray_of": (i, most), "time_of": (f, most), "t_of": (f, most), "f_of": (f, most), "p_of": (d, most), "q_of": (d,
@@ -130,39 +142,59 @@ def ray_store(slots: int, units: int, levels: int, appearance_levels: int) -> St
     }  # fmt: skip
     sizes: Sizes = {name: (dtype, (n,)) for name, (dtype, n) in lengths.items()}
     sizes["s_block"] = f, (most, FIRST_FEATURE_ROW + FEATURES * appearance_levels)
-    return Store(slots, RayStore, sizes | _network(most, units, levels))
+    return tuple((sizes | _network(most, units, levels)).items())
 
 
 def shading_store(slots: int, weights: ShaderWeights) -> Store[ShadingStore]:
     """Matrices have whole tiles."""
-    rows, columns = map(_tiles, weights.first.shape)
+    return Store(slots, ShadingStore, _shading_sizes(*weights.first.shape, *weights.heads.shape))
+
+
+@functools.cache
+def _shading_sizes(units: int, inputs: int, outputs: int, width: int) -> Key:
+    rows, columns = _tiles(units), _tiles(inputs)
     most = 2 * shading.CHUNK  # surfaces, of which a ray meets two at the most
-    block, heads = (most, rows), weights.heads.shape
+    block = most, rows
     shapes = {
         "x": (most, columns), "h1": block, "h2": block, "g1": block, "g2": block,
         "first_out": (rows, columns), "first_bias_out": (rows,), "second_out": (rows, rows), "second_bias_out": (rows,),
-        "heads_out": tuple(heads), "heads_bias_out": (heads[0],),
+        "heads_out": (outputs, width), "heads_bias_out": (outputs,),
     }  # fmt: skip
-    return Store(slots, ShadingStore, {name: (np.float32, shape) for name, shape in shapes.items()})
+    return tuple((name, (np.float32, shape)) for name, shape in shapes.items())
 
 
 def tap_store(slots: int, units: int, levels: int) -> Store[TapStore]:
     """Of points at which a surface of so many hidden units and levels is asked for its gradient."""
+    return Store(slots, TapStore, _tap_sizes(units, levels))
+
+
+@functools.cache
+def _tap_sizes(units: int, levels: int) -> Key:
     sizes = _network(_TAPS, units, levels)
     del sizes["hidden"]
-    return Store(slots, TapStore, {"used": (np.int64, (1,)), **sizes})
+    return tuple({"used": (np.int64, (1,)), **sizes}.items())
 
 
 def table_store(slots: int, units: int, levels: int, appearance_levels: int) -> Store[TableStore]:
     """Of the samples and sections of rays, of such a surface and an appearance of so many levels."""
+    return Store(slots, TableStore, _table_sizes(units, levels, appearance_levels))
+
+
+@functools.cache
+def _table_sizes(units: int, levels: int, appearance_levels: int) -> Key:
     sizes = _network(CAPACITY, units, levels)
     del sizes["hidden"]
     sizes["s_block"] = np.float32, (CAPACITY, FIRST_FEATURE_ROW + FEATURES * appearance_levels)
-    return Store(slots, TableStore, {"samples": (np.int64, (1,)), "sections": (np.int64, (1,)), **sizes})
+    return tuple({"samples": (np.int64, (1,)), "sections": (np.int64, (1,)), **sizes}.items())
 
 
 def chunk_scratch(slots: int, units: int, features: int, materials: int, hidden: int) -> Store[ChunkScratch]:
     """Of a surface of so many hidden units, rays with so many features, numbers of a material and hidden units of its network."""
+    return Store(slots, ChunkScratch, _scratch_sizes(units, features, materials, hidden))
+
+
+@functools.cache
+def _scratch_sizes(units: int, features: int, materials: int, hidden: int) -> Key:
     f = np.float32
     rows, columns = 2 * CHUNK, (2, CHUNK)
     three, some = (f, (rows, 3)), 2 * shading.CHUNK
@@ -177,11 +209,16 @@ def chunk_scratch(slots: int, units: int, features: int, materials: int, hidden:
         "x": (f, (some, _tiles(features))), "h": (f, (some, _tiles(hidden))), "y": (f, (some, _tiles(materials))),
         "gy": (f, (some, _tiles(materials))), "gh": (f, (some, _tiles(hidden))),
     }  # fmt: skip
-    return Store(slots, ChunkScratch, sizes)
+    return tuple(sizes.items())
 
 
 def light_out(slots: int, features: int, materials: int, hidden: int, lamps: int, outputs: int) -> Store[LightOut]:
     """Of chunks of such rays, K lamps and the shader's outputs."""
+    return Store(slots, LightOut, _light_sizes(features, materials, hidden, lamps, outputs))
+
+
+@functools.cache
+def _light_sizes(features: int, materials: int, hidden: int, lamps: int, outputs: int) -> Key:
     f = np.float32
     sizes: Sizes = {
         "first": (f, (_tiles(hidden), _tiles(features))), "first_bias": (f, (_tiles(hidden),)), "second": (f, (_tiles(materials),
@@ -189,4 +226,4 @@ def light_out(slots: int, features: int, materials: int, hidden: int, lamps: int
         "second_bias": (f, (materials,)), "position": (f, (lamps, 3)), "spectrum": (f, (lamps, outputs)), "far": (f, (features,)),
         "loss": (np.float64, ()),
     }  # fmt: skip
-    return Store(slots, LightOut, sizes)
+    return tuple(sizes.items())
