@@ -1,4 +1,4 @@
-"""A fit beside busy processes: python recipes/bench/busy.py [--repeats 3].
+"""A fit beside busy processes: python recipes/bench/busy.py compare [--repeats 3].
 
 Fits of the example scene, of equal steps, alone and beside one and two processes that keep a core each busy, in turns. Of n threads on c
 cores beside b such processes a scheduler that is fair to threads gives the fit c / (n + b) of what it has alone: what it loses beyond that
