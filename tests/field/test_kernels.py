@@ -159,22 +159,18 @@ def test_nothing_is_stored_where_no_gradient_can_be_asked_for(monkeypatch: pytes
     assert slots[2:] == [-(-600 // CHUNK)]
 
 
-def test_stores_are_used_again_and_let_go_when_far_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stores_are_used_again_and_let_go_when_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stores, "_pool", pool := [])
-    first = stores.tap_store(4, 8, 2)
-    block = first.arrays.block
-    del first
-    again = stores.tap_store(3, 8, 2)
-    assert again.arrays.block is block and not pool
-    del again
-    large = stores.tap_store(40, 8, 2)
-    assert len(large.arrays.block) >= 40 and not pool  # one of the kind: needs grow
-    del large
-    small = stores.tap_store(4, 8, 2)
-    assert len(small.arrays.block) == 4 and not pool  # that of a call that needed ten times as much is let go
-    for levels in range(1, 30):
-        stores.tap_store(4, 8, levels)
-    assert len(pool) <= 12
+    first, large = stores.tap_store(4, 8, 2), stores.tap_store(40, 8, 2)
+    block, wide = first.arrays.block, large.arrays.block
+    assert len(block) == 4 and len(wide) >= 40
+    del first, large
+    for _ in range(300):  # in turns: both stay
+        assert stores.tap_store(3, 8, 2).arrays.block is block
+        assert stores.tap_store(33, 8, 2).arrays.block is wide
+    for _ in range(300):  # the large one is not used for a small call, and goes
+        assert stores.tap_store(3, 8, 2).arrays.block is block
+    assert [arrays.block is block for _, arrays, _ in pool] == [True]
 
 
 def test_hidden_units_come_in_fours() -> None:

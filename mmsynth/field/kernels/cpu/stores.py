@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -19,10 +20,11 @@ from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
-_POOLED = 12
-_SPARE = 4  # times the slots that are needed: larger arrays are let go
+_SPARE = 4  # times the slots that are needed: larger arrays are for others
+_IDLE = 100  # stores that were asked for since: what was not used again is let go
 _TAPS = 4 * MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
-_pool: list[tuple[Any, Any]] = []
+_pool: list[tuple[Any, Any, int]] = []  # of each, when it was given back
+_asked = itertools.count()
 
 
 class SurfaceStore(NamedTuple):
@@ -91,19 +93,20 @@ class Store(Generic[S]):
     arrays: S
 
     def __init__(self, slots: int, kind: Callable[..., S], sizes: Key) -> None:
-        self.key = kind, sizes
+        self.key, now = (kind, sizes), next(_asked)
         slots = 1 << max(slots - 1, 3).bit_length()
-        for index, (key, arrays) in enumerate(_pool):
+        _pool[:] = [entry for entry in _pool if now - entry[2] <= _IDLE]
+        for index, (key, arrays, _) in enumerate(_pool):
             if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots:
                 self.arrays = _pool.pop(index)[1]
-                return
-        _pool[:] = [(key, arrays) for key, arrays in _pool if key != self.key]  # too few slots, and needs grow; or far too many
-        self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
+                break
+        else:
+            self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
+        self.now = now
 
     def __del__(self) -> None:
-        if hasattr(self, "arrays"):  # none where memory lacked for them
-            _pool.append((self.key, self.arrays))
-            del _pool[:-_POOLED]  # what was not asked for for long
+        if hasattr(self, "now"):  # none where memory lacked for arrays
+            _pool.append((self.key, self.arrays, self.now))
 
 
 def _tiles(count: int) -> int:
