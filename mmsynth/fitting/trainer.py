@@ -300,14 +300,14 @@ class Trainer:
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
         out, relative = {}, np.empty(len(batch.origins), np.float32)
-        of_numbers, weight = squared.numpy(), batch.ray_weight.numpy()
+        of_numbers, weight = squared.numpy(force=True), batch.ray_weight.numpy(force=True)  # on a GPU without Triton, too
         for name, (rays, numbers) in batch.parts.items():
             found, count = of_numbers[numbers], rays.stop - rays.start
             if len(found) > count:
                 found = found.reshape(count, -1).mean(1)
             out[name] = float(weight[rays] @ found) / count
             relative[rays] = np.sqrt(found) / self.measurements[name].radiance_scale
-        self.importance.learn(batch.tile, torch.from_numpy(relative))
+        self.importance.learn(batch.tile, torch.from_numpy(relative).to(batch.tile.device))
         return out
 
     @property
