@@ -256,9 +256,9 @@ class DeviceStep:
                 *surface, appearance, field.occupancy.states, shader, network, far_light, aimed, view, drawn.measured,
                 kernels.Gains(log_gain, drawn.frame), opacities, eikonal, now,
             )  # fmt: skip
-            learned = learn_all(told, of_shader, of_light)
+            loss_parts, squared, samples = learn_all(told, of_shader, of_light)
             f = self.flat
-            optimiser.check(learned.loss, f.gradient, learned.samples, self.steps, self.told[:4])
+            optimiser.check(loss_parts, f.gradient, samples, self.steps, self.told[:4])
             optimiser.guarded_adam(f.values, f.gradient, (f.first, f.second), f.rates, f.kinds, numbers.factors, self.steps, BETAS, EPSILON)
             for name, kind in _TABLES.items():
                 p, moments = self.adam.parameters[name], self.adam.moments[name]
@@ -266,7 +266,7 @@ class DeviceStep:
                     p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, numbers.factors,
                     self.steps, BETAS, EPSILON, sparse=True,
                 )  # fmt: skip
-            stepping.tally(drawn, learned.squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)
+            stepping.tally(drawn, squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)
 
         return work
 

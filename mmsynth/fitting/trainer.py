@@ -83,7 +83,6 @@ class Trainer:
         rates |= {**dict.fromkeys(tables, schedule.learning_rate_grid), _GAINS: schedule.learning_rate_exposure}
         self.optimiser = Adam(parameters, rates, sparse=tables)
         self.average = Average(parameters)
-        self.networks = [p for n, p in parameters.items() if n not in tables]
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.state = FitState(rays=recipe.sampling.initial_rays, rays_after=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
@@ -143,7 +142,7 @@ class Trainer:
         asked = self._to_draw(state.step + 1, state.rays_after)
         learned, rays, state.rays = self._learn(drawn, sampling, asked.drawings), state.rays, state.rays_after
         self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
-        wrong = self._wrong(learned.loss)
+        wrong = self._wrong(learned)
         if wrong is not None:
             self._skip(wrong)
             return
@@ -249,12 +248,12 @@ class Trainer:
         outside = {name: -(-count // _OUTSIDE) for name, count in counts.items()}
         return ToDraw(counts, (of_pixels, empty_drawing_of(self.measurements, outside, random)), generator)
 
-    def _wrong(self, loss: torch.Tensor) -> str | None:
+    def _wrong(self, learned: kernels.Learned) -> str | None:
         """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
         # what is NaN in a sample is NaN in a sum
-        if not bool(torch.isfinite(loss)):
+        if not math.isfinite(learned.loss):
             reason = "the loss is not finite"
-        elif not bool(torch.isfinite(torch.cat([p.grad.flatten() for p in self.networks if p.grad is not None]).sum())):
+        elif not math.isfinite(learned.gradients):
             reason = "a gradient is not finite"
         else:
             return None

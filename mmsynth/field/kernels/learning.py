@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -73,7 +73,13 @@ def learn(step: Step) -> Learned:
     off = torch.linalg.vector_norm(slopes, dim=-1) - 1.0
     loss = loss + eikonal.weight / max(asked, 1) * (torch.where(off < 0.0, shallow, 1.0) * off.square()).sum()
     loss.backward()
-    return Learned(loss.detach(), squared, hits.samples)
+    learned = *network[:2], *shader, *light[:-1], far_light, gains.log_gain
+    return Learned(loss.detach(), sum_of_gradients(learned), squared, hits.samples)
+
+
+def sum_of_gradients(tensors: Iterable[Tensor]) -> Tensor:
+    """Of those that have any, a scalar."""
+    return torch.cat([t.grad.flatten() for t in tensors if t.grad is not None]).sum()
 
 
 def with_far_light(hits: Hits, far_light: Tensor) -> Hits:

@@ -269,9 +269,11 @@ class Step(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Of a step: the loss, a scalar; squared (M,), residuals; samples, a number; what was drawn beside it."""
+    """Of a step: the loss, a scalar; the sum of all gradients but those of tables, finite if each is; squared (M,), residuals; samples, a
+    number; what was drawn beside it."""
 
     loss: Tensor
+    gradients: Tensor
     squared: Tensor
     samples: Tensor
     drawn: tuple[Drawn, ...] = ()

@@ -1,7 +1,8 @@
 """A step of a fit on the CPU, fused: each chunk of rays passes from its samples to all gradients of its loss in one go, in the caches.
 
 Chunks are tasks that threads take from a counter, so that none waits for another that the machine has slowed; what they leave is per chunk,
-and summed in the order of the chunks. The tables follow when all chunks are done: a task for each level (``learn_tables``).
+and summed in the order of the chunks. The tables follow when all chunks are done: a task for each level
+(``add_gradients``).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from mmsynth.field.kernels.cpu import shading
 from mmsynth.field.kernels.cpu.blocks import scatter_block
 from mmsynth.field.kernels.cpu.drawing import draw_chunk, drawing_tasks
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
+from mmsynth.field.kernels.cpu.matrices import add_sum, add_sums
 from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backward, see_mirrors
 from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
 from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
@@ -39,6 +41,26 @@ class TableStore(NamedTuple):
     sections: np.ndarray
     turned_out: np.ndarray
     output_out: np.ndarray
+
+
+class WeightGradients(NamedTuple):
+    """Of a surface's network, of ``ShaderWeights``, of ``LightNetwork`` (empty where nothing shines), and of the light from far."""
+
+    hidden: np.ndarray
+    output: np.ndarray
+    first: np.ndarray
+    first_bias: np.ndarray
+    second: np.ndarray
+    second_bias: np.ndarray
+    heads: np.ndarray
+    heads_bias: np.ndarray
+    light_first: np.ndarray
+    light_first_bias: np.ndarray
+    light_second: np.ndarray
+    light_second_bias: np.ndarray
+    position: np.ndarray
+    log_spectrum: np.ndarray
+    far_light: np.ndarray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -190,7 +212,7 @@ def learn_rays(  # type: ignore[no-untyped-def]
     measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
     g_gain,
 ):  # fmt: skip
-    """See ``learning.learn``: all but the gradients of the tables, which ``learn_tables`` adds up.
+    """See ``learning.learn``: what it leaves per chunk, ``add_gradients`` adds up.
 
     surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
     there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: see ``to_draw``.
@@ -205,10 +227,52 @@ def learn_rays(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
-    """Take levels, of the surface's table and then of the appearance's, until there are none."""
+def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
+    """Add to the gradients of weights, biases and lamps what each chunk found: the sum of all that they are then, finite if each is."""
+    g, units = gradients, gradients.hidden.shape[0]
+    add_sum(kept.turned_out[:chunks], g.hidden.T)
+    add_sum(taps.turned_out[:tasks], g.hidden.T)
+    for parts in (kept.output_out[:chunks], taps.output_out[:tasks]):
+        add_sums(parts, g.output[:units])
+        add_sums(parts[:, parts.shape[1] - 1 :], g.output[units:])  # behind the units of whole tiles
+    add_sum(shaded.first_out[:chunks], g.first)
+    add_sums(shaded.first_bias_out[:chunks], g.first_bias)
+    add_sum(shaded.second_out[:chunks], g.second)
+    add_sums(shaded.second_bias_out[:chunks], g.second_bias)
+    add_sum(shaded.heads_out[:chunks], g.heads)
+    add_sums(shaded.heads_bias_out[:chunks], g.heads_bias)
+    if len(used):
+        add_sum(out.first[:chunks], g.light_first)
+        add_sums(out.first_bias[:chunks], g.light_first_bias)
+        for i in range(len(rows)):
+            add_sums(out.second[:chunks, i], g.light_second[rows[i]])
+            add_sums(out.second_bias[:chunks, i : i + 1], g.light_second_bias[rows[i] : rows[i] + 1])
+        lamp = np.empty(spectrum.shape[1], np.float32)
+        for i in range(len(used)):
+            add_sums(out.position[:chunks, i], g.position[used[i]])
+            lamp[:] = _ZERO
+            add_sums(out.spectrum[:chunks, i], lamp)
+            for j in range(lamp.shape[0]):
+                g.log_spectrum[used[i], j] += spectrum[i, j] * lamp[j]
+    add_sums(out.far[:chunks], g.far_light)
+    total = np.float64(0.0)
+    for matrix in (g.hidden, g.first, g.second, g.heads, g.light_first, g.light_second, g.position, g.log_spectrum):
+        total += matrix.sum()
+    for vector in (g.output, g.first_bias, g.second_bias, g.heads_bias, g.light_first_bias, g.light_second_bias, g.far_light):
+        total += vector.sum()
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_up(  # type: ignore[no-untyped-def]
+    next_task, chunks, point_chunks, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients, total
+):  # fmt: skip
+    """Take the weights, and then levels, of the surface's table and then of the appearance's, until there are none."""
     while True:
-        task = take(next_task, 0)
+        task = take(next_task, 0) - 1
+        if task < 0:
+            total[0] = _add_weights(chunks, chunks + point_chunks, kept, taps, shaded, out, rows, used, spectrum, gradients)
+            continue
         level = task - grid.active
         if level >= appearance.active:
             return
@@ -222,9 +286,18 @@ def _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, g
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def learn_tables(threads, next_task, rays, points, grid, appearance, kept, taps, gradient, a_gradient):  # type: ignore[no-untyped-def]
-    """Add what ``learn_rays`` found to the gradients of both tables, a task for each level."""
+def add_gradients(  # type: ignore[no-untyped-def]
+    threads, next_task, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients,
+    total,
+):  # fmt: skip
+    """Add what ``learn_rays`` found to the gradients of both tables, a task for each level, and of all else, ``WeightGradients``.
+
+    rows, used: of the light's second layer and of the lamps those that there are; spectrum: of these lamps. total: (1,), of the last.
+    """
     chunks, point_chunks = (rays + CHUNK - 1) // CHUNK, (points + POINTS - 1) // POINTS
     next_task[0] = 0
     for _ in prange(threads):
-        _add_levels(next_task, chunks, point_chunks, grid, appearance, kept, taps, gradient, a_gradient)
+        _add_up(
+            next_task, chunks, point_chunks, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient,
+            gradients, total,
+        )  # fmt: skip

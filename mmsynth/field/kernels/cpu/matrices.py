@@ -121,6 +121,16 @@ def add_sum(parts, out):  # type: ignore[no-untyped-def]
             out[i, j] += total[j]
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_sums(parts, out):  # type: ignore[no-untyped-def]
+    """The same of vectors (N, ≥ columns)."""
+    for j in range(out.shape[0]):
+        total = np.float32(0.0)
+        for n in range(parts.shape[0]):
+            total += parts[n, j]
+        out[j] += total
+
+
 @njit(cache=True, inline="always", error_model="numpy")
 def whole(count, of):  # type: ignore[no-untyped-def]
     """``count`` rounded up to a multiple."""

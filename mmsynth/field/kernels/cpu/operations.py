@@ -20,9 +20,9 @@ from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.blocks import surface_layers
 from mmsynth.field.kernels.cpu.drawing import nothing_to_draw, to_draw
-from mmsynth.field.kernels.cpu.learning import TableStore
+from mmsynth.field.kernels.cpu.learning import TableStore, WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
-from mmsynth.field.kernels.cpu.matrices import add_sum, padded
+from mmsynth.field.kernels.cpu.matrices import padded
 from mmsynth.field.kernels.cpu.shading import Layers, two_layers
 from mmsynth.field.kernels.cpu.slopes import TapStore
 from mmsynth.field.kernels.cpu.stores import (
@@ -37,7 +37,7 @@ from mmsynth.field.kernels.cpu.stores import (
     tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
-from mmsynth.field.kernels.learning import gradient_of
+from mmsynth.field.kernels.learning import gradient_of, no_light
 from mmsynth.field.kernels.parameters import (
     Drawing,
     GridTable,
@@ -319,7 +319,8 @@ def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
     lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining: Any = _arrays(light._replace(second=light.second[columns], second_bias=light.second_bias[columns]))
+    shining: Any = _arrays(light)
+    shining = shining._replace(second=shining.second[columns], second_bias=shining.second_bias[columns])
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
@@ -341,39 +342,18 @@ def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
         _arrays(opacities), _arrays(eikonal), first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays,
         out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
-    gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
-    learning.learn_tables(threads, next_task, count, points, table, look, kept.arrays, taps.arrays, *gradients)
-    inner, outer = gradient_of(network.hidden).numpy().T, gradient_of(network.output).numpy()
-    for arrays, parts in ((kept.arrays, chunks), (taps.arrays, tasks)):
-        add_sum(arrays.turned_out[:parts], inner)
-        padded_outer = np.zeros(arrays.output_out.shape[1], np.float32)
-        _add(arrays.output_out[:parts], padded_outer)
-        outer += np.append(padded_outer[:units], padded_outer[-1])
-    for name, weight in shader._asdict().items():
-        _add(getattr(weights.arrays, f"{name}_out")[:chunks], gradient_of(weight).numpy())
-    found = out.arrays
-    if len(used):
-        _add(found.first[:chunks], gradient_of(light.first).numpy())
-        _add(found.first_bias[:chunks], gradient_of(light.first_bias).numpy())
-        one = np.float32(1.0)
-        for weight, rows, of_chunks, factor in (
-            (light.second, columns, found.second, one), (light.second_bias, columns, found.second_bias, one),
-            (light.position, used, found.position, one), (light.log_spectrum, used, found.spectrum, lamps.spectrum),
-        ):  # fmt: skip
-            of_rows = np.zeros((len(rows), *weight.shape[1:]), np.float32)
-            _add(of_chunks[:chunks], of_rows)
-            gradient_of(weight).numpy()[rows] += factor * of_rows
-    if len(far_light):
-        _add(found.far[:chunks], gradient_of(far_light).numpy())
+    total, shines = np.zeros(1), len(used) > 0
+    learned = (*network[:2], *shader, *(light[:6] if shines else no_light("cpu")[:6]), far_light)
+    gradients = WeightGradients(*(gradient_of(x).numpy() for x in learned))
+    learning.add_gradients(
+        threads, next_task, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used, lamps.spectrum,
+        gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy(), gradients, total,
+    )  # fmt: skip
     if len(gain):
         by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
-        gradient_of(gains.log_gain).numpy()[...] += (by_frame - by_frame.mean()).astype(np.float32)
-    loss = torch.tensor(found.loss[:tasks].sum(), dtype=torch.float32)
-    return Learned(loss, torch.from_numpy(squared), torch.tensor(samples.sum()), tuple(drawn for _, drawn in to_fill))
-
-
-def _add(parts: np.ndarray, gradient: np.ndarray) -> None:
-    """See ``add_sum``; of vectors, too."""
-    if gradient.ndim == 1:
-        parts, gradient = parts[:, None], gradient[None]
-    add_sum(parts, gradient)
+        of_gains = by_frame - by_frame.mean()
+        total += of_gains.sum()
+        gradient_of(gains.log_gain).numpy()[...] += of_gains.astype(np.float32)
+    sums = out.arrays.loss[:tasks].sum(), total[0], samples.sum()
+    loss, gradient, samples_total = (torch.from_numpy(np.array(x, kind)) for x, kind in zip(sums, (np.float32, float, int), strict=True))
+    return Learned(loss, gradient, torch.from_numpy(squared), samples_total, tuple(drawn for _, drawn in to_fill))

@@ -16,7 +16,7 @@ from mmsynth.field.kernels.cuda.shared import jit, tl, triton
 from mmsynth.field.kernels.cuda.slopes import eikonal_programs, eikonal_term, normals_backward, places
 from mmsynth.field.kernels.cuda.surface import surface_gradient
 from mmsynth.field.kernels.cuda.tracing import trace
-from mmsynth.field.kernels.learning import gradient_of
+from mmsynth.field.kernels.learning import gradient_of, sum_of_gradients
 from mmsynth.field.kernels.parameters import Gains, Lamps, Learned, Mirrors, ShadedRays, Step
 
 _BLOCK = 1024
@@ -100,14 +100,14 @@ def _add_rows(parts: Tensor, first: Tensor, second: Tensor) -> None:
             )
 
 
-def learn_all(step: Step, of_shader: Tensor, of_light: Tensor) -> Learned:
+def learn_all(step: Step, of_shader: Tensor, of_light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """``learn``, of which gradients are added to the ``grad`` of what is left, and those of
 
         of_shader: the shader's weights and the far light, one after the other, as they are given, to this array (W,).
         of_light: the first six parts of the light, one after the other, to this one (V,), empty without lamps.
 
     Returns:
-        the loss (n,) float64, to be summed.
+        the loss (n,) float64, to be summed; squared and samples, see ``Learned``.
     """
     grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
     with torch.enable_grad():
@@ -139,16 +139,17 @@ def learn_all(step: Step, of_shader: Tensor, of_light: Tensor) -> Learned:
         _gain_backward(gains, gain, compared.gain)
     _add_rows(partial, of_shader, of_light)
     torch.autograd.backward([hits.features, hits.share, slopes], [compared.features, compared.share, found.gradient])
-    return Learned(loss, compared.squared, hits.samples)
+    return loss, compared.squared, hits.samples
 
 
 def learn(step: Step) -> Learned:
     """See ``learning.learn``; float32, ``measured.ray`` never decreasing."""
     weights = [*step.shader, step.far_light], [*(step.light[:6] if len(step.light.used) else ())]
     sums = [step.rays.origins.new_zeros(sum(w.numel() for w in some)) for some in weights]
-    found = learn_all(step, *sums)
+    loss, squared, samples = learn_all(step, *sums)
     for some, whole in zip(weights, sums, strict=True):
         for weight, part in zip(some, whole.split([w.numel() for w in some]) if some else (), strict=True):
             if weight.numel():
                 gradient_of(weight).add_(part.view_as(weight))
-    return found._replace(loss=found.loss.sum().float())
+    learned = *step.network[:2], *step.shader, *step.light[:-1], step.far_light, step.gains.log_gain
+    return Learned(loss.sum().float(), sum_of_gradients(learned), squared, samples)
