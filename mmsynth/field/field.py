@@ -237,7 +237,8 @@ class Field(nn.Module):
         lamps = self.light.lamps() if self.light is not None and self.shines and modalities else None
         mirrors = None if lamps is None else self.mirrors(hits, origins, directions, self.sampling.active_surface)[0]
         images = None if lamps is None or mirrors is None else kernels.reflect(lamps.position, mirrors)
-        around = None if mirrors is None else kernels.surround(mirrors)
+        polarized = any(self.sensors[n].is_polarization for n in modalities)
+        around = kernels.surround(mirrors) if mirrors is not None and polarized else None  # others do not see how light swings
         lit = hits.share if mirrors is None else mirrors.share  # of what has a place
         outputs = {d: self.shader(shaded.features, directions[ray], d) for d in {self.view_dependence[n] for n in modalities}}
 

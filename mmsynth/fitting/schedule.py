@@ -33,13 +33,14 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     )
 
 
-def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
+def surface_rate_factor(sharpness: float, recipe: Recipe, background: bool = False) -> float:
     """Beyond some sharpness the surface's rates fall in proportion to the width of the soft surface.
 
     A step of Adam moves the surface by about its rate, whatever the gradient. Where that is a good part of the soft surface,
-    the surface never settles: colours blur and views disagree.
+    the surface never settles: colours blur and views disagree. In contracted space, which the background needs, this begins at half the
+    sharpness: what lies far away moves by more than its distance in that space (measured, see recipes/bench/results.md).
     """
-    return min(1.0, recipe.schedule.full_rate_sharpness / sharpness)
+    return min(1.0, recipe.schedule.full_rate_sharpness * (0.5 if background else 1.0) / sharpness)
 
 
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:
