@@ -33,14 +33,13 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     )
 
 
-def surface_rate_factor(sharpness: float, recipe: Recipe, background: bool = False) -> float:
+def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
     """Beyond some sharpness the surface's rates fall in proportion to the width of the soft surface.
 
     A step of Adam moves the surface by about its rate, whatever the gradient. Where that is a good part of the soft surface,
-    the surface never settles: colours blur and views disagree. Where the background is modelled, in contracted space, this begins at
-    half the sharpness: one capture with a background lost 0.7 to 1.5 dB without, objects gain 0.2 to 0.6 (recipes/bench/results.md).
+    the surface never settles: colours blur and views disagree.
     """
-    return min(1.0, recipe.schedule.full_rate_sharpness * (0.5 if background else 1.0) / sharpness)
+    return min(1.0, recipe.schedule.full_rate_sharpness / sharpness)
 
 
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:

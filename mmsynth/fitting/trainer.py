@@ -175,7 +175,7 @@ class Trainer:
             self.prepared = prepared
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
-        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), self._surface_rate(sampling))
+        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
         self._average()
         state.rays_total += sum(stage.rays)
         state.step += 1
@@ -263,12 +263,9 @@ class Trainer:
     def _update(self, sampling: kernels.Sampling) -> None:
         """A step of the optimiser, and of the mean over the last parameters."""
         field, done = self.field, self.progress
-        slower = dict.fromkeys(self.of_surface, self._surface_rate(sampling))
+        slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
         self.optimiser.step(learning_rate_factor(done, self.recipe), slower, field.rows_met(sampling))
         self._average()
-
-    def _surface_rate(self, sampling: kernels.Sampling) -> float:
-        return surface_rate_factor(sampling.sharpness, self.recipe, self.needs.design.background)
 
     def _average(self) -> None:
         """Take the parameters into the mean over the last ones, now and then at the end of a fit."""

@@ -49,12 +49,3 @@ def test_noise_moves_a_surface_by_less_than_a_quarter_of_its_softness_however_sh
         f"Adam at one rate: trembles by {usual:.2g} of its softness",
         f"{ours:.2g}",
     )
-
-
-def test_a_surface_in_contracted_space_slows_down_at_half_the_sharpness() -> None:
-    """A capture with a background lost 0.7 to 1.5 dB at the rates that are best for objects alone."""
-    recipe = Recipe()
-    full = recipe.schedule.full_rate_sharpness
-    assert surface_rate_factor(full, recipe) == surface_rate_factor(0.5 * full, recipe, background=True) == 1.0
-    for sharpness in (2 * full, 20 * full):
-        assert surface_rate_factor(sharpness, recipe, background=True) == 0.5 * surface_rate_factor(sharpness, recipe)
