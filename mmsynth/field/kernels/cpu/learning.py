@@ -1,8 +1,8 @@
 """A step of a fit on the CPU, fused: each chunk of rays passes from its samples to all gradients of its loss in one go, in the caches.
 
 Chunks are tasks that threads take from a counter, so that none waits for another that the machine has slowed; what they leave is per chunk,
-and summed in the order of the chunks. The tables follow when all chunks are done: a task for each level
-(``add_gradients``).
+and summed in the order of the chunks. That follows when all are done (``add_gradients``): a task for each level of a table, one for the
+weights.
 """
 
 from __future__ import annotations

@@ -20,11 +20,10 @@ from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.blocks import surface_layers
 from mmsynth.field.kernels.cpu.drawing import nothing_to_draw, to_draw
-from mmsynth.field.kernels.cpu.learning import TableStore, WeightGradients
+from mmsynth.field.kernels.cpu.learning import WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.matrices import padded
 from mmsynth.field.kernels.cpu.shading import Layers, two_layers
-from mmsynth.field.kernels.cpu.slopes import TapStore
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
     SurfaceStore,
@@ -99,17 +98,11 @@ def _kept(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def _of_weights(arrays: SurfaceStore | RayStore | TableStore | TapStore, chunks: int, like: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _summed(arrays: SurfaceStore | RayStore, chunks: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of a network's hidden layer, which is like this one, and of its last."""
     units, inputs = like.shape
-    output = arrays.output_out[:chunks].sum(0)
-    return arrays.turned_out[:chunks].sum(0)[:inputs, :units].T, np.append(output[:units], output[-1])
-
-
-def _summed(arrays: SurfaceStore | RayStore, chunks: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """The same for autograd."""
-    hidden, output = _of_weights(arrays, chunks, like)
-    return torch.from_numpy(np.ascontiguousarray(hidden)), torch.from_numpy(output)
+    hidden, output = arrays.turned_out[:chunks].sum(0)[:inputs, :units].T, arrays.output_out[:chunks].sum(0)
+    return torch.from_numpy(np.ascontiguousarray(hidden)), torch.from_numpy(np.append(output[:units], output[-1]))
 
 
 def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
