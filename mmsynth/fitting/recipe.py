@@ -81,7 +81,15 @@ class SamplingRecipe(_Section):
     """Which rays a step draws, and where samples lie along them."""
 
     samples_per_step: int = _key(
-        16384, "Surface samples of an optimiser step [samples]; the number of rays follows. On a GPU 262144 at least.", ge=256
+        16384,
+        "Surface samples of an optimiser step in the middle of a fit [samples]; the number of rays follows. On a GPU 262144 at least.",
+        ge=256,
+    )
+    samples_growth: float = _key(
+        4.0,
+        "Samples of the last step [samples of the first]: early steps may be rough and quick, late ones average.",
+        ge=1,
+        le=64,
     )
     initial_rays: int = _key(256, "Rays of the first step [rays].", ge=1)
     evenly: float = _key(

@@ -33,6 +33,11 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     )
 
 
+def samples_of_step(progress: float, recipe: Recipe) -> float:
+    """They grow exponentially: larger batches do for noise what smaller rates do (Smith et al. 2018), and see more rays."""
+    return recipe.sampling.samples_per_step * recipe.sampling.samples_growth ** (progress - 0.5)
+
+
 def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
     """Beyond some sharpness the surface's rates fall in proportion to the width of the soft surface.
 

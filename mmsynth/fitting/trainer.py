@@ -32,7 +32,7 @@ from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.progress import FitProgress, FitState
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, samples_of_step, sampling_at, surface_rate_factor
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, opacities
@@ -154,11 +154,11 @@ class Trainer:
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(drawn.batch.origins)
         state.samples_total += samples
-        state.rays_after = self._adapted(rays, self.recipe.sampling.samples_per_step, samples, _MOST_RAYS)
+        state.rays_after = self._adapted(rays, samples_of_step(self.progress, self.recipe), samples, _MOST_RAYS)
         state.step += 1
 
-    def _adapted(self, rays: int, wanted: int, samples: float, most: int) -> int:
-        """A fixed number of samples a step: the number of rays follows, by at most a factor of two either way.
+    def _adapted(self, rays: int, wanted: float, samples: float, most: int) -> int:
+        """So many samples a step: the number of rays follows, by at most a factor of two either way.
 
         Args:
             rays: that gave so many samples.
@@ -195,7 +195,7 @@ class Trainer:
             state.mean_loss = news.loss if keep == 0.0 else keep * state.mean_loss + (1 - keep) * news.loss
             for name, error in news.errors.items():
                 state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
-        wanted = max(self.recipe.sampling.samples_per_step, step.samples)
+        wanted = max(samples_of_step(self.progress, self.recipe), step.samples)
         state.rays = self._adapted(state.rays, wanted, news.samples / news.steps, step.most_rays)
 
     def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:

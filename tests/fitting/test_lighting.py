@@ -21,7 +21,8 @@ from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
 
 SMALL = Recipe().with_changes({
-    "sampling.samples_per_step": 2048, "surface.levels": 3, "surface.max_rows_log2": 12, "radiance.levels": 3, "radiance.max_rows_log2": 12,
+    "sampling.samples_per_step": 2048, "sampling.samples_growth": 1.0,
+    "surface.levels": 3, "surface.max_rows_log2": 12, "radiance.levels": 3, "radiance.max_rows_log2": 12,
     "sampling.occupancy_resolution": 24, "poses.views": "off", "poses.rig": "off",
 })  # fmt: skip
 

@@ -29,7 +29,8 @@ SENSORS = {
 CAMERA = Camera(24, 18, 25.0, 25.0, 11.5, 8.5)
 DISC = np.hypot(*(np.mgrid[:18, :24] - np.array([8.5, 11.5])[:, None, None])) < 5
 SMALL = Recipe().with_changes({
-    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "surface.levels": 4, "surface.max_rows_log2": 12,
+    "sampling.samples_per_step": 2048, "sampling.samples_growth": 1.0,
+    "sampling.initial_rays": 128, "surface.levels": 4, "surface.max_rows_log2": 12,
     "radiance.levels": 4, "radiance.max_rows_log2": 12, "surface.cells_per_pixel": 0.5, "radiance.cells_per_pixel": 1.0,
     "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 16, "surface.initial_radius": 0.3,
     "schedule.sharpness_start": 20.0, "surface.measurements_per_cell": 1e-3, "radiance.view_dependence": 0, "radiance.exposure": "off",

@@ -19,7 +19,8 @@ from mmsynth.scene.scene import Scene, keep_frames
 
 SIZE, FOCAL, VIEWS = 36, 48.0, 14
 SMALL = {
-    "sampling.samples_per_step": 4096, "sampling.initial_rays": 256, "surface.max_rows_log2": 12, "radiance.max_rows_log2": 13,
+    "sampling.samples_per_step": 4096, "sampling.samples_growth": 1.0,
+    "sampling.initial_rays": 256, "surface.max_rows_log2": 12, "radiance.max_rows_log2": 13,
     "sampling.occupancy_resolution": 24, "loss.eikonal_points": 128, "radiance.hidden_width": 32, "schedule.view_dependence_from": 0.2,
     # fits as short as these use directions for what is wrong elsewhere: over eight of them, degree 0 cost a diffuse ball up to 6.6 %
     "radiance.view_dependence_min_improvement": 0.1,

@@ -24,7 +24,8 @@ from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Scene, keep_frames
 
 SMALL = {
-    "sampling.samples_per_step": 4096, "sampling.initial_rays": 256, "surface.levels": 4, "surface.max_rows_log2": 13,
+    "sampling.samples_per_step": 4096, "sampling.samples_growth": 1.0,
+    "sampling.initial_rays": 256, "surface.levels": 4, "surface.max_rows_log2": 13,
     "radiance.levels": 5, "radiance.max_rows_log2": 14, "sampling.occupancy_resolution": 32, "loss.eikonal_points": 256,
     "radiance.hidden_width": 32, "radiance.view_dependence": 1,
 }  # fmt: skip

@@ -24,7 +24,8 @@ from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Region, Scene, Sensor
 
 SMALL: dict[str, Any] = {
-    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "surface.levels": 4, "radiance.levels": 4,
+    "sampling.samples_per_step": 2048, "sampling.samples_growth": 1.0,
+    "sampling.initial_rays": 128, "surface.levels": 4, "radiance.levels": 4,
     "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 4, "loss.eikonal_points": 64, "radiance.hidden_width": 32,
     "surface.max_rows_log2": 16, "radiance.max_rows_log2": 17, "radiance.cells_per_pixel": 30.0, "surface.cells_per_row": 2.0,
     "radiance.cells_per_row": 2.0, "surface.rays_per_row": 0.002, "radiance.rays_per_row": 1e-3, "schedule.tables_at": 0.125,

@@ -31,7 +31,7 @@ from mmsynth.fitting.measurements import draw, load_measurements
 from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.run import fit
-from mmsynth.fitting.schedule import learning_rate_factor, sampling_at
+from mmsynth.fitting.schedule import learning_rate_factor, samples_of_step, sampling_at
 from mmsynth.fitting.terms import eikonal
 from mmsynth.fitting.trainer import Trainer
 from mmsynth.operations.evaluation.evaluate import evaluate
@@ -43,7 +43,7 @@ from mmsynth.sensors.camera import Camera, ray_map, resized
 
 # every number that a result here depends on: the defaults are tuned from time to time
 SMALL = Recipe().with_changes({
-    "sampling.samples_per_step": 2048, "sampling.initial_rays": 128, "sampling.evenly": 0.5,
+    "sampling.samples_per_step": 2048, "sampling.samples_growth": 4.0, "sampling.initial_rays": 128, "sampling.evenly": 0.5,
     "surface.levels": 4, "surface.max_rows_log2": 12,
     "radiance.levels": 4, "radiance.max_rows_log2": 12, "surface.cells_per_pixel": 0.5, "radiance.cells_per_pixel": 1.0,
     "surface.hidden_width": 32, "radiance.hidden_width": 64, "sampling.occupancy_resolution": 24, "sampling.occupancy_every": 16,
@@ -317,17 +317,21 @@ def test_length_is_steps_or_time(scene: Scene) -> None:
             Trainer(scene, SMALL, steps, budget, 0, "cpu")
 
 
-def test_the_number_of_rays_follows_the_samples(scene: Scene) -> None:
-    trainer = _trainer(scene, 40, **{"sampling.occupancy_every": 4})
-    counts, samples = [trainer.state.rays], []
-    for _ in range(40):
+@pytest.mark.parametrize("grown", [1.0, 9.0])
+def test_the_number_of_rays_follows_the_samples(scene: Scene, grown: float) -> None:
+    trainer = _trainer(scene, 80, **{"sampling.occupancy_every": 4, "sampling.samples_growth": grown})
+    counts, samples, wanted = [trainer.state.rays], [], []
+    for _ in range(80):
         before = trainer.state.samples_total
+        wanted.append(samples_of_step(trainer.progress, trainer.recipe))
         trainer.run_step()
         counts.append(trainer.state.rays)
         samples.append(trainer.state.samples_total - before)
     growth = np.array(counts[1:]) / np.array(counts[:-1])
     assert growth.max() <= 1.5 and growth.min() >= 0.74
-    assert counts[0] == 128 and 0.7 < np.median(samples[-15:]) / 2048 < 1.4
+    taken = np.array(samples) / np.array(wanted)
+    assert counts[0] == 128 and 0.7 < np.median(taken[-15:]) < 1.4
+    assert np.median(samples[-10:]) / np.median(samples[35:45]) == pytest.approx(grown ** (35 / 80), rel=0.2)
 
 
 # --- what is not a number
@@ -600,6 +604,12 @@ def test_the_learning_rate_rises_and_falls() -> None:
     factors = np.array([learning_rate_factor(p, SMALL) for p in np.linspace(0, 1, 101)])
     assert factors[0] == 0.02 and (factors[1:34] == 1).all() and (np.diff(factors[34:]) < 0).all()
     assert factors[-1] == pytest.approx(0.1)
+
+
+def test_late_steps_take_more_samples() -> None:
+    samples = np.array([samples_of_step(p, SMALL) for p in np.linspace(0, 1, 101)])
+    np.testing.assert_allclose(samples[[0, 50, 100]], [1024, 2048, 4096])
+    np.testing.assert_allclose(samples[1:] / samples[:-1], 4**0.01)
 
 
 def test_recipes() -> None:

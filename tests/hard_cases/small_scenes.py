@@ -14,7 +14,8 @@ from mmsynth.fitting.recipe import Recipe
 
 WIDTH, HEIGHT, FOCAL, RADIUS = 32, 24, 40.0, 0.7
 QUICK = Recipe().with_changes({
-    "sampling.samples_per_step": 1024, "sampling.initial_rays": 128, "surface.levels": 3, "surface.max_rows_log2": 12,
+    "sampling.samples_per_step": 1024, "sampling.samples_growth": 1.0,
+    "sampling.initial_rays": 128, "surface.levels": 3, "surface.max_rows_log2": 12,
     "radiance.levels": 3, "radiance.max_rows_log2": 12, "sampling.occupancy_resolution": 16, "sampling.occupancy_every": 8,
     "loss.eikonal_points": 64, "radiance.hidden_width": 16,
 })  # fmt: skip

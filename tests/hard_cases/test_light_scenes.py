@@ -22,7 +22,8 @@ SIZE, FOCAL, VIEWS, FINER = 36, 48.0, 30, 4
 DISTANCE, RADIUS = 2.6, 0.7
 FOOTPRINT = DISTANCE / FOCAL  # of a pixel at the origin
 SMALL = {
-    "sampling.samples_per_step": 4096, "sampling.initial_rays": 256, "surface.max_rows_log2": 12, "radiance.max_rows_log2": 13,
+    "sampling.samples_per_step": 4096, "sampling.samples_growth": 1.0,
+    "sampling.initial_rays": 256, "surface.max_rows_log2": 12, "radiance.max_rows_log2": 13,
     "sampling.occupancy_resolution": 24, "loss.eikonal_points": 128, "radiance.hidden_width": 32, "schedule.view_dependence_from": 0.2,
     "poses.views": "off", "poses.rig": "off",
 }  # fmt: skip
