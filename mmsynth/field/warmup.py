@@ -27,7 +27,7 @@ def warm_up() -> None:
     than in every later process, which loads the kernels from the cache. Where there is no cache, this process has to compile.
     """
     if not cpu.is_compiled():
-        print("compiling kernels once, about a minute ...", file=sys.stderr, flush=True)
+        print("compiling kernels once, one to three minutes ...", file=sys.stderr, flush=True)
         command = [sys.executable, "-c", "from mmsynth.field.warmup import run_kernels; run_kernels()"]
         subprocess.run(command, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True)
         cpu.remove_old_kernels()
