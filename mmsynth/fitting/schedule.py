@@ -34,7 +34,10 @@ def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
 
 
 def samples_of_step(progress: float, recipe: Recipe) -> float:
-    """They grow exponentially: larger batches do for noise what smaller rates do (Smith et al. 2018), and see more rays."""
+    """How many surface samples a step should take.
+
+    They grow exponentially over a fit: a larger batch does for noise what a smaller rate does (Smith et al. 2018), and sees more rays.
+    """
     return recipe.sampling.samples_per_step * recipe.sampling.samples_growth ** (progress - 0.5)
 
 

@@ -158,10 +158,10 @@ class Trainer:
         state.step += 1
 
     def _adapted(self, rays: int, wanted: float, samples: float, most: int) -> int:
-        """So many samples a step: the number of rays follows, by at most a factor of two either way.
+        """The number of rays for a step of so many samples: half of the way there, of a factor of two at the most either way.
 
         Args:
-            rays: that gave so many samples.
+            rays: that gave ``samples``. wanted: samples.
         """
         ratio = min(2.0, max(0.5, wanted / max(samples, 1)))
         return int(min(most, max(len(self.measurements), 0.5 * rays * (1 + ratio))))
