@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from mmsynth.field import kernels
+from mmsynth.field.kernels.learning import gradient_of
 
 BETAS = (0.9, 0.99)
 EPSILON = 1e-15
@@ -18,7 +19,9 @@ class Adam:
     """Adam over named parameters. A step clears the gradients.
 
     Args:
-        sparse: names of those of which a step changes only what has a gradient, see ``kernels.adam``.
+        sparse: names of those of which a step changes only what has a gradient, see ``kernels.AdamStep``.
+    Attributes:
+        count: of steps.
     """
 
     def __init__(self, parameters: dict[str, nn.Parameter], rates: dict[str, float], sparse: Collection[str] = ()) -> None:
@@ -26,24 +29,25 @@ class Adam:
         self.moments = {n: [torch.zeros_like(p), torch.zeros_like(p)] for n, p in parameters.items()}
         self.count = 0
 
-    @torch.no_grad()
-    def step(self, factor: float, slower: dict[str, float] | None = None, rows: dict[str, int] | None = None) -> None:
-        """One step with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too.
+    def parts(self, factor: float, slower: dict[str, float] | None = None) -> list[kernels.AdamPart]:
+        """What a step takes, with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too.
 
-        Args:
-            rows: how many of the first rows of a parameter were ever met: without a gradient the others would stay as they are.
+        Who takes it counts it in ``count``.
         """
-        self.count += 1
         parts = []
         for name, p in self.parameters.items():
-            if p.grad is not None:
-                rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
-                first, second = self.moments[name]
-                step = kernels.AdamStep(rate, *BETAS, EPSILON, self.count, name in self.sparse)
-                met = None if rows is None else rows.get(name)
-                all_of = p, p.grad, first, second, step
-                parts.append(all_of if met is None else (p[:met], p.grad[:met], first[:met], second[:met], step))
-        kernels.adam_together(parts)
+            rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
+            step = kernels.AdamStep(rate, *BETAS, EPSILON, self.count + 1, name in self.sparse)
+            first, second = self.moments[name]
+            parts.append(kernels.AdamPart(p, gradient_of(p), first, second, step))
+        return parts
+
+    @torch.no_grad()
+    def step(self, factor: float) -> None:
+        """One step, with all rates times ``factor``."""
+        for part in self.parts(factor):
+            kernels.adam(*part)
+        self.count += 1
 
     def resize(self, name: str, kept: int) -> None:
         """Follow a parameter that has new rows behind its first ``kept``."""

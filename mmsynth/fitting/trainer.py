@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -140,17 +140,24 @@ class Trainer:
             drawn = drawn_step(self.field, self.measurements, asked, [kernels.draw(*drawing) for drawing in asked.drawings])
         self._prepare(sampling, drawn.generator)
         asked = self._to_draw(state.step + 1, state.rays_after)
-        learned, rays, state.rays = self._learn(drawn, sampling, asked.drawings), state.rays, state.rays_after
-        self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
+        rays, state.rays, errors = state.rays, state.rays_after, dict[str, float]()
+
+        def meanwhile(learned: kernels.Learned) -> None:
+            self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
+            if math.isfinite(learned.loss):
+                errors.update(self._errors(drawn.batch, learned.squared))
+
+        learned = self._learn(drawn, sampling, asked.drawings, self._update(sampling), meanwhile)
         wrong = self._wrong(learned)
         if wrong is not None:
             self._skip(wrong)
             return
-        self._update(sampling)
+        self.optimiser.count += 1
+        self._average()
         keep = 0.98 if state.step else 0.0
         value, before, samples = float(learned.loss), state.mean_loss, int(learned.samples)
         state.mean_loss = value if math.isnan(before) else keep * before + (1 - keep) * value  # nan: all were skipped
-        for name, error in self._errors(drawn.batch, learned.squared).items():
+        for name, error in errors.items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(drawn.batch.origins)
         state.samples_total += samples
@@ -260,12 +267,10 @@ class Trainer:
         self.optimiser.clear()
         return reason
 
-    def _update(self, sampling: kernels.Sampling) -> None:
-        """A step of the optimiser, and of the mean over the last parameters."""
-        field, done = self.field, self.progress
+    def _update(self, sampling: kernels.Sampling) -> list[kernels.AdamPart]:
+        """What a step of the optimiser takes."""
         slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
-        self.optimiser.step(learning_rate_factor(done, self.recipe), slower, field.rows_met(sampling))
-        self._average()
+        return self.optimiser.parts(learning_rate_factor(self.progress, self.recipe), slower)
 
     def _average(self) -> None:
         """Take the parameters into the mean over the last ones, now and then at the end of a fit."""
@@ -273,8 +278,11 @@ class Trainer:
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _learn(self, drawn: DrawnStep, sampling: kernels.Sampling, ahead: Sequence[kernels.Drawing]) -> kernels.Learned:
-        """The loss of a batch; gradients are added to ``grad`` of all that is learned. Other rays are drawn beside it."""
+    def _learn(
+        self, drawn: DrawnStep, sampling: kernels.Sampling, ahead: Sequence[kernels.Drawing] = (), update: Sequence[kernels.AdamPart] = (),
+        meanwhile: Callable[[kernels.Learned], None] | None = None,
+    ) -> kernels.Learned:  # fmt: skip
+        """The loss of a batch; gradients are added to ``grad`` of all that is learned. See ``kernels.learn``."""
         field, batch, rays = self.field, drawn.batch, drawn.rays
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
@@ -294,7 +302,7 @@ class Trainer:
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
             eikonal(field, sampling, self.recipe, self.progress, drawn.generator), sampling,
         )  # fmt: skip
-        return kernels.learn(step, ahead)
+        return kernels.learn(step, ahead, update, meanwhile)
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""

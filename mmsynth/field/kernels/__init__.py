@@ -9,6 +9,7 @@ agree on. README.md says how to add one.
 from __future__ import annotations
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -21,6 +22,7 @@ from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.learning import no_light
 from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
 from mmsynth.field.kernels.parameters import (
+    AdamPart,
     AdamStep,
     Cameras,
     Drawing,
@@ -54,6 +56,7 @@ __all__ = [
     "OUTSIDE",
     "SHELL",
     "SOLID",
+    "AdamPart",
     "AdamStep",
     "Cameras",
     "Drawing",
@@ -82,7 +85,6 @@ __all__ = [
     "Surroundings",
     "View",
     "adam",
-    "adam_together",
     "compare",
     "contract",
     "contracted_velocity",
@@ -173,13 +175,28 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
 
 
-def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
-    """A step's loss, and its gradients, added to ``grad`` of what is learned; beside it, two drawings at the most."""
+def learn(
+    step: Step, ahead: Sequence[Drawing] = (), update: Sequence[AdamPart] = (), meanwhile: Callable[[Learned], None] | None = None
+) -> Learned:
+    """A step's loss, its gradients, added to ``grad`` of what is learned, and of what these are a step of Adam, see ``AdamPart``: where
+    loss or gradients are not finite nothing moves, and these stay.
+
+    Args:
+        ahead: what is drawn beside it, two drawings at the most.
+        meanwhile: called with what was learned before anything moves or, where there are cores for both, while it does: the sum of the
+            gradients may not be known then.
+    """
     backend = _backend(step.rays.origins)
     if backend is cpu:
-        return cpu.learn(step, ahead)
+        return cpu.learn(step, ahead, update, meanwhile)
     learned: Learned = learning.learn(step) if backend is reference else backend.learn(step)
-    return learned._replace(drawn=tuple(draw(*drawing) for drawing in ahead))
+    learned = learned._replace(drawn=tuple(draw(*drawing) for drawing in ahead))
+    if meanwhile is not None:
+        meanwhile(learned)
+    if update and math.isfinite(learned.loss) and math.isfinite(learned.gradients):
+        for part in update:
+            adam(*part)
+    return learned
 
 
 def draw(
@@ -197,12 +214,3 @@ def odds(residual: Tensor, count: Tensor, first_tile: Tensor, evenly: float) -> 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """One step of Adam, in place."""
     _backend(parameter).adam(parameter, gradient, first, second, step)
-
-
-def adam_together(parts: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, AdamStep]]) -> None:
-    """The same of many tensors, what ``adam`` takes of each."""
-    if all(_backend(part[0]) is cpu for part in parts):
-        cpu.adam_together(parts)
-        return
-    for part in parts:
-        adam(*part)

@@ -296,6 +296,16 @@ class AdamStep(NamedTuple):
     sparse: bool = False
 
 
+class AdamPart(NamedTuple):
+    """What ``reference.adam`` takes of a tensor."""
+
+    parameter: Tensor
+    gradient: Tensor
+    first: Tensor
+    second: Tensor
+    step: AdamStep
+
+
 class Frames(NamedTuple):
     """The F frames of all modalities, those of one together; what they hold, as it was stored.
 

@@ -12,7 +12,7 @@ KERNELS = (
     surface.surface_forward, surface.surface_backward, surface.surface_scatter,
     marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
     shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward,
-    learning.learn_rays, learning.add_gradients, drawing.draw_rays, drawing.fill_odds, optimiser.adam_parts,
+    learning.learn_rays, learning.finish, drawing.draw_rays, drawing.fill_odds, optimiser.adam_tensor,
 )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """A step of a fit on the CPU, fused: each chunk of rays passes from its samples to all gradients of its loss in one go, in the caches.
 
 Chunks are tasks that threads take from a counter, so that none waits for another that the machine has slowed; what they leave is per chunk,
-and summed in the order of the chunks. That follows when all are done (``add_gradients``): a task for each level of a table, one for the
-weights.
+and summed in the order of the chunks. That follows when all are done (``finish``): a task for each level of a table, one for the weights,
+and then steps of Adam.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from mmsynth.field.kernels.cpu.drawing import draw_chunk, drawing_tasks
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
 from mmsynth.field.kernels.cpu.matrices import add_sum, add_sums
 from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backward, see_mirrors
+from mmsynth.field.kernels.cpu.optimiser import take_parts
 from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
 from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
-from mmsynth.field.kernels.cpu.tasks import take
+from mmsynth.field.kernels.cpu.tasks import take, tell, wait
 from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
 from mmsynth.field.kernels.parameters import Rays, ShadedRays
 
@@ -212,7 +213,7 @@ def learn_rays(  # type: ignore[no-untyped-def]
     measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
     g_gain,
 ):  # fmt: skip
-    """See ``learning.learn``: what it leaves per chunk, ``add_gradients`` adds up.
+    """See ``learning.learn``: what it leaves per chunk, ``finish`` adds up.
 
     surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
     there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: see ``to_draw``.
@@ -264,40 +265,47 @@ def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, g
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_up(  # type: ignore[no-untyped-def]
-    next_task, chunks, point_chunks, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients, total
+def finish(  # type: ignore[no-untyped-def]
+    next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients, sums,
+    places, numbers,
 ):  # fmt: skip
-    """Take the weights, and then levels, of the surface's table and then of the appearance's, until there are none."""
+    """Add what ``learn_rays`` found to the gradients of both tables, a task for each level, and of all else, ``WeightGradients``, and then
+    take a step of Adam where all are finite: until no task is left.
+
+    rows, used: of the light's second layer and of the lamps those that there are; spectrum: of these lamps. done: (1 + levels,), what has
+    its gradients: first the weights, then levels of the surface, then of the appearance. sums: (2,), the loss, and the sum of gradients of
+    gains, to which that of all weights is added. places, numbers: see ``take_parts``.
+    """
+    chunks, point_chunks = (rays + CHUNK - 1) // CHUNK, (points + POINTS - 1) // POINTS
     while True:
         task = take(next_task, 0) - 1
-        if task < 0:
-            total[0] = _add_weights(chunks, chunks + point_chunks, kept, taps, shaded, out, rows, used, spectrum, gradients)
-            continue
         level = task - grid.active
         if level >= appearance.active:
-            return
-        for chunk in range(chunks):
-            if level < 0:
-                scatter_block(kept.block[chunk], kept.samples[chunk, 0], grid, gradient, task)
-            else:
-                scatter_block(kept.s_block[chunk], kept.sections[chunk, 0], appearance, a_gradient, level)
-        for chunk in range(chunks + point_chunks if level < 0 else 0):
-            scatter_block(taps.block[chunk], taps.used[chunk, 0], grid, gradient, task)
+            break
+        if task < 0:
+            sums[1] += _add_weights(chunks, chunks + point_chunks, kept, taps, shaded, out, rows, used, spectrum, gradients)
+        else:
+            for chunk in range(chunks):
+                if level < 0:
+                    scatter_block(kept.block[chunk], kept.samples[chunk, 0], grid, gradient, task)
+                else:
+                    scatter_block(kept.s_block[chunk], kept.sections[chunk, 0], appearance, a_gradient, level)
+            for chunk in range(chunks + point_chunks if level < 0 else 0):
+                scatter_block(taps.block[chunk], taps.used[chunk, 0], grid, gradient, task)
+        tell(done, task + 1)
+    wait(done, 0)
+    if math.isfinite(sums[0]) and math.isfinite(sums[1]):
+        take_parts(next_task, level - appearance.active, len(done), done, places, numbers)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def add_gradients(  # type: ignore[no-untyped-def]
-    threads, next_task, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients,
-    total,
+def finish_together(  # type: ignore[no-untyped-def]
+    threads, next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient,
+    gradients, sums, places, numbers,
 ):  # fmt: skip
-    """Add what ``learn_rays`` found to the gradients of both tables, a task for each level, and of all else, ``WeightGradients``.
-
-    rows, used: of the light's second layer and of the lamps those that there are; spectrum: of these lamps. total: (1,), of the last.
-    """
-    chunks, point_chunks = (rays + CHUNK - 1) // CHUNK, (points + POINTS - 1) // POINTS
-    next_task[0] = 0
+    """``finish``, by so many threads."""
     for _ in prange(threads):
-        _add_up(
-            next_task, chunks, point_chunks, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient,
-            gradients, total,
+        finish(
+            next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients,
+            sums, places, numbers,
         )  # fmt: skip

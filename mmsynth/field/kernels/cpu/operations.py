@@ -7,12 +7,12 @@ follows autograd's rules.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from numba import get_num_threads
+from numba import get_num_threads, set_num_threads
 from torch import Tensor
 
 from mmsynth.field.kernels import reference
@@ -23,6 +23,7 @@ from mmsynth.field.kernels.cpu.drawing import nothing_to_draw, to_draw
 from mmsynth.field.kernels.cpu.learning import WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.matrices import padded
+from mmsynth.field.kernels.cpu.optimiser import places_and_numbers
 from mmsynth.field.kernels.cpu.shading import Layers, two_layers
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
@@ -36,8 +37,10 @@ from mmsynth.field.kernels.cpu.stores import (
     tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
+from mmsynth.field.kernels.cpu.tasks import beside
 from mmsynth.field.kernels.learning import gradient_of, no_light
 from mmsynth.field.kernels.parameters import (
+    AdamPart,
     Drawing,
     GridTable,
     Hits,
@@ -300,8 +303,10 @@ class _Mirror(torch.autograd.Function):
 
 
 @torch.no_grad()
-def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
-    """See ``learning.learn``; float32, ``measured.ray`` never decreasing. Beside it, two drawings at the most."""
+def learn(
+    step: Step, ahead: Sequence[Drawing] = (), update: Sequence[AdamPart] = (), meanwhile: Callable[[Learned], None] | None = None
+) -> Learned:
+    """See ``kernels.learn`` and ``learning.learn``; float32, ``measured.ray`` never decreasing."""
     grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), get_num_threads()
@@ -335,18 +340,42 @@ def learn(step: Step, ahead: Sequence[Drawing] = ()) -> Learned:
         _arrays(opacities), _arrays(eikonal), first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays,
         out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
-    total, shines = np.zeros(1), len(used) > 0
+    shines = len(used) > 0
     learned = (*network[:2], *shader, *(light[:6] if shines else no_light("cpu")[:6]), far_light)
     gradients = WeightGradients(*(gradient_of(x).numpy() for x in learned))
-    learning.add_gradients(
-        threads, next_task, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used, lamps.spectrum,
-        gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy(), gradients, total,
-    )  # fmt: skip
+    loss, sums = out.arrays.loss[:tasks].sum(), np.zeros(2)
     if len(gain):
         by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
         of_gains = by_frame - by_frame.mean()
-        total += of_gains.sum()
         gradient_of(gains.log_gain).numpy()[...] += of_gains.astype(np.float32)
-    sums = out.arrays.loss[:tasks].sum(), total[0], samples.sum()
-    loss, gradient, samples_total = (torch.from_numpy(np.array(x, kind)) for x, kind in zip(sums, (np.float32, float, int), strict=True))
-    return Learned(loss, gradient, torch.from_numpy(squared), samples_total, tuple(drawn for _, drawn in to_fill))
+        sums[1] = of_gains.sum()
+    sums[0] = loss
+    found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
+    result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(drawn for _, drawn in to_fill))
+    of_levels: dict[int, tuple[Any, int]] = {
+        grid.table.data_ptr(): (table.offsets[: grid.active + 1], 1),
+        appearance.table.data_ptr(): (look.offsets[: appearance.active + 1], 1 + grid.active),
+    }
+    next_task[0], done = 0, np.zeros(1 + grid.active + appearance.active, np.int64)
+    to_do = (
+        next_task, done, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used, lamps.spectrum,
+        gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy(), gradients, sums, *places_and_numbers(update, of_levels),
+    )  # fmt: skip
+    others = beside(_finish, threads - 1, to_do) if threads > 1 else None
+    try:
+        if meanwhile is not None:
+            meanwhile(result)
+    finally:
+        learning.finish(*to_do)
+        if others is not None:
+            others.result()
+    return result
+
+
+def _finish(threads: int, to_do: tuple[Any, ...]) -> None:
+    """So many threads take the tasks of ``learning.finish``."""
+    if threads == 1:
+        learning.finish(*to_do)
+        return
+    set_num_threads(threads)
+    learning.finish_together(threads, *to_do)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numba import get_num_threads, njit, prange, types
+from numba import njit, prange, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from torch import Tensor
 
-from mmsynth.field.kernels.cpu.tasks import take
-from mmsynth.field.kernels.parameters import AdamStep
+from mmsynth.field.kernels.constants import FEATURES
+from mmsynth.field.kernels.cpu.tasks import take, wait
+from mmsynth.field.kernels.parameters import AdamPart, AdamStep
 
 ADAM_CHUNK = 16384  # parameters at a time
 
@@ -51,30 +53,35 @@ def _at(typingctx, address, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _take_parts(next_task, places, numbers):  # type: ignore[no-untyped-def]
+def take_parts(next_task, task, others, done, places, numbers):  # type: ignore[no-untyped-def]
+    """``adam_part`` of N tensors, from a task that was taken on until there are none; the counter counts so many others before them.
+
+    places: (N, 7) addresses of parameters, gradients and moments, how many, whether sparse, and which of ``done`` says that the gradient is
+    known. numbers: (N, 5), the others.
+    """
     tensor, before = 0, 0  # tasks of the tensors before
     while True:
-        task = take(next_task, 0)
         while tensor < len(places) and (task - before) * ADAM_CHUNK >= places[tensor, 4]:
             before += (places[tensor, 4] + ADAM_CHUNK - 1) // ADAM_CHUNK
             tensor += 1
         if tensor == len(places):
             return
+        wait(done, places[tensor, 6])
         begin = (task - before) * ADAM_CHUNK
         count, at = min(ADAM_CHUNK, places[tensor, 4] - begin), 4 * begin
         p, g = _at(places[tensor, 0] + at, count), _at(places[tensor, 1] + at, count)
         m, v = _at(places[tensor, 2] + at, count), _at(places[tensor, 3] + at, count)
         rate, beta1, beta2, root, epsilon = numbers[tensor]
         adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon, places[tensor, 5] != 0)
+        task = take(next_task, 0) - others
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def adam_parts(threads, next_task, places, numbers):  # type: ignore[no-untyped-def]
-    """``adam_part`` of N tensors. places: (N, 6) addresses of parameters, gradients and moments, how many, whether sparse; numbers: (N, 5),
-    the others."""
-    next_task[0] = 0
-    for _ in prange(threads):
-        _take_parts(next_task, places, numbers)
+def adam_tensor(p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
+    """``adam_part`` of a whole tensor (N,)."""
+    for task in prange((len(p) + ADAM_CHUNK - 1) // ADAM_CHUNK):
+        some = slice(task * ADAM_CHUNK, (task + 1) * ADAM_CHUNK)
+        adam_part(p[some], g[some], m[some], v[some], rate, beta1, beta2, root, epsilon, sparse)
 
 
 def _numbers(step: AdamStep) -> tuple[float, ...]:
@@ -82,14 +89,27 @@ def _numbers(step: AdamStep) -> tuple[float, ...]:
     return step.rate / (1 - step.beta1**step.number), step.beta1, step.beta2, root, step.epsilon
 
 
+def places_and_numbers(parts: Sequence[AdamPart], levels: Mapping[int, tuple[np.ndarray, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Of tensors as ``take_parts`` takes them, in the order in which their gradients are known; float32, contiguous.
+
+    levels: of a table, by its address, where its levels in use begin and end, in rows, and which of ``done`` is the first one's.
+    """
+    found: list[tuple[list[int], tuple[float, ...]]] = []
+    for *tensors, step in parts:
+        addresses, numbers = [x.data_ptr() for x in tensors], _numbers(step)
+        if addresses[0] not in levels:
+            found.append(([*addresses, tensors[0].numel(), step.sparse, 0], numbers))
+            continue
+        offsets, first = levels[addresses[0]]
+        for level, (begin, end) in enumerate(itertools.pairwise(offsets.tolist())):
+            at = [x + 4 * FEATURES * begin for x in addresses]
+            found.append(([*at, FEATURES * (end - begin), step.sparse, first + level], numbers))
+    found.sort(key=lambda part: part[0][-1])
+    places, of_steps = np.array([part[0] for part in found], np.int64), np.array([part[1] for part in found], np.float32)
+    return places.reshape(-1, 7), of_steps.reshape(-1, 5)
+
+
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """See ``reference.adam``; float32."""
-    adam_together([(parameter, gradient, first, second, step)])
-
-
-def adam_together(parts: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, AdamStep]]) -> None:
-    """``adam`` of many tensors at once; float32, contiguous."""
-    if parts:
-        places = [(*(x.data_ptr() for x in tensors), tensors[0].numel(), step.sparse) for *tensors, step in parts]
-        numbers = [_numbers(part[4]) for part in parts]
-        adam_parts(get_num_threads(), np.zeros(1, np.int64), np.array(places, np.int64), np.array(numbers, np.float32))
+    rate, *others = (np.float32(x) for x in _numbers(step))
+    adam_tensor(*(x.detach().view(-1).numpy() for x in (parameter, gradient, first, second)), rate, *others, step.sparse)
