@@ -43,9 +43,9 @@ class Adam:
         return parts
 
     @torch.no_grad()
-    def step(self, factor: float) -> None:
-        """One step, with all rates times ``factor``."""
-        for part in self.parts(factor):
+    def step(self, factor: float, slower: dict[str, float] | None = None) -> None:
+        """One step, see ``parts``."""
+        for part in self.parts(factor, slower):
             kernels.adam(*part)
         self.count += 1
 

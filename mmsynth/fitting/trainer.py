@@ -99,6 +99,7 @@ class Trainer:
             self.state.rays = max(self.state.rays, self.on_device.first_rays)
         self.prepared: tuple[Any, ...] = ()  # of the last step on the device, what was then
         self.coming: DrawnStep | None = None
+        self.random_ahead = 0, self._random(0)  # of a step, made beside the kernels of one before
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -144,10 +145,11 @@ class Trainer:
 
         def meanwhile(learned: kernels.Learned) -> None:
             self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
+            self.random_ahead = state.step + 2, self._random(state.step + 2)
             if math.isfinite(learned.loss):
                 errors.update(self._errors(drawn.batch, learned.squared))
 
-        learned = self._learn(drawn, sampling, asked.drawings, self._update(sampling), meanwhile)
+        learned = self._learn(drawn, sampling, asked.drawings, lambda: self._update(sampling), meanwhile)
         wrong = self._wrong(learned)
         if wrong is not None:
             self._skip(wrong)
@@ -244,7 +246,8 @@ class Trainer:
 
     def _to_draw(self, step: int, rays: int) -> ToDraw:
         """The rays of a step."""
-        random, generator = self._random(step)
+        known, numbers = self.random_ahead
+        random, generator = numbers if known == step else self._random(step)
         total = sum(self.needs.share.values())
         counts = {n: max(1, int(rays * share / total)) for n, share in self.needs.share.items()}
         of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, self.importance.selection)
@@ -279,9 +282,13 @@ class Trainer:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
     def _learn(
-        self, drawn: DrawnStep, sampling: kernels.Sampling, ahead: Sequence[kernels.Drawing] = (), update: Sequence[kernels.AdamPart] = (),
+        self,
+        drawn: DrawnStep,
+        sampling: kernels.Sampling,
+        ahead: Sequence[kernels.Drawing] = (),
+        update: Callable[[], Sequence[kernels.AdamPart]] | None = None,
         meanwhile: Callable[[kernels.Learned], None] | None = None,
-    ) -> kernels.Learned:  # fmt: skip
+    ) -> kernels.Learned:
         """The loss of a batch; gradients are added to ``grad`` of all that is learned. See ``kernels.learn``."""
         field, batch, rays = self.field, drawn.batch, drawn.rays
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone

@@ -75,8 +75,8 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
     }
 
 
-def _run(step: dict[str, Any], dtype: torch.dtype, *ahead: Sequence[kernels.Drawing]) -> tuple[kernels.Learned, dict[str, Tensor]]:
-    """What was learned, and all gradients by name."""
+def _told(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Step, dict[str, nn.Parameter]]:
+    """A step as kernels take it, and all that is learned by name."""
     modules = {n: m.to(dtype) for n, m in step.items() if isinstance(m, nn.Module)}
     for m in modules.values():
         m.zero_grad()
@@ -89,8 +89,13 @@ def _run(step: dict[str, Any], dtype: torch.dtype, *ahead: Sequence[kernels.Draw
         tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
         tuples["eikonal"], step["sampling"],
     )  # fmt: skip
+    return told, {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
+
+
+def _run(step: dict[str, Any], dtype: torch.dtype, *ahead: Sequence[kernels.Drawing]) -> tuple[kernels.Learned, dict[str, Tensor]]:
+    """What was learned, and all gradients by name."""
+    told, parameters = _told(step, dtype)
     found = (kernels.learn if dtype == torch.float32 or ahead else learning.learn)(told, *ahead)
-    parameters = {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
     return found, {n: p.grad.clone() for n, p in parameters.items() if p.grad is not None and p.numel()}
 
 
@@ -151,6 +156,72 @@ def test_rays_of_the_next_step_are_drawn_beside_it(dtype: torch.dtype, count: in
         theirs = kernels.draw(*drawing)
         for one, other in zip((*ours[:-1], *ours.measured), (*theirs[:-1], *theirs.measured), strict=True):
             assert torch.equal(one.nan_to_num(-1.0), other.nan_to_num(-1.0))
+
+
+def _parts(parameters: dict[str, nn.Parameter]) -> list[kernels.AdamPart]:
+    """A third step of Adam, of which tables are sparse."""
+    torch.manual_seed(2)
+    rates = {n: 0.01 * (k + 1) for k, n in enumerate(parameters)}
+    steps = {n: kernels.AdamStep(rate, 0.9, 0.99, 1e-15, 3, n.endswith(".table")) for n, rate in rates.items()}
+    moments = {n: (torch.randn_like(p), torch.rand_like(p)) for n, p in parameters.items()}
+    return [kernels.AdamPart(p, learning.gradient_of(p), *moments[n], steps[n]) for n, p in parameters.items()]
+
+
+def _with_update(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Learned, list[Tensor], list[Any]]:
+    """What was learned, parameters, gradients and moments after it, and what was told meanwhile."""
+    told, parameters = _told(step, dtype)
+    parts, heard = _parts(parameters), list[Any]()
+    found = kernels.learn(told, (), lambda: parts, lambda learned: heard.append((learned.loss.clone(), learned.squared.clone())))
+    return found, [x.detach().clone() for part in parts for x in part[:4]], heard
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+@pytest.mark.parametrize("case", ["all", "plain"])
+def test_a_step_of_adam_comes_with_it(case: str, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same to the bit as Adam by itself after it, by any number of threads."""
+    from mmsynth.field.kernels.cpu import operations
+
+    monkeypatch.setattr(operations, "get_num_threads", lambda: threads)
+    told, parameters = _told(_step(*CASES[case]), torch.float32)
+    alone, parts = kernels.learn(told), _parts(parameters)
+    moved = [bool(part.gradient.any()) for part in parts]
+    with torch.no_grad():
+        for part in parts:
+            kernels.adam(*part)
+    found, after, heard = _with_update(_step(*CASES[case]), torch.float32)
+    assert found.loss == alone.loss and found.gradients == alone.gradients and sum(moved) > 8
+    assert all(torch.equal(x, y) for x, y in zip(after, (x.detach() for part in parts for x in part[:4]), strict=True))
+    assert not any(x.any() for x in after[1::4])
+    ((loss, squared),) = heard
+    assert loss == alone.loss and torch.equal(squared, alone.squared)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("what", ["the loss", "a gradient"])
+def test_nothing_moves_by_what_is_not_finite(what: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = _step(*CASES["all"])
+    if what == "the loss":
+        step["measured"].target[5] = torch.nan
+        before = [p.detach().clone() for p in _told(step, dtype)[1].values()]
+    else:
+        before = [p.detach().clone() for p in _told(step, dtype)[1].values()]
+        monkeypatch.setattr(learning, "gradient_of", lambda p, known=learning.gradient_of: known(p).fill_(torch.nan))
+    found, after, heard = _with_update(step, dtype)
+    assert torch.isfinite(found.loss) == (what == "a gradient") and not torch.isfinite(found.gradients)
+    assert all(torch.equal(x, y) for x, y in zip(after[::4], before, strict=True))
+    assert any(torch.isnan(g).any() for g in after[1::4]) and len(heard) == 1
+
+
+def test_what_fails_beside_the_kernels_is_raised() -> None:
+    told, _ = _told(_step(*CASES["plain"]), torch.float32)
+
+    def fails(*_: Any) -> Any:
+        raise LookupError("beside")
+
+    for arguments in ((fails, None), (None, fails)):
+        with pytest.raises(LookupError, match="beside"):
+            kernels.learn(told, (), *arguments)
+    assert torch.isfinite(kernels.learn(told).loss)
 
 
 def test_far_light_is_what_a_ray_without_surface_shows() -> None:

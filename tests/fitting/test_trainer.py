@@ -414,7 +414,7 @@ def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     trainer.recipe = _recipe(**changes)
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
     drawn = DrawnStep(batch, _rays(trainer, batch), torch.Generator().manual_seed(0))
-    return float(trainer._learn(drawn, sampling, ()).loss)
+    return float(trainer._learn(drawn, sampling).loss)
 
 
 def _rays(trainer: Trainer, batch: Any) -> kernels.Rays:

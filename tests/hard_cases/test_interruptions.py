@@ -85,7 +85,7 @@ def test_out_of_memory_in_a_step(
     """In the middle of a step, half of which is done: the checkpoint before it is what is gone on from."""
     with monkeypatch.context() as now:
         update = Trainer._update
-        now.setattr(Trainer, "_update", lambda self, sampling: (update(self, sampling), self.state.step == 3 and allocate()))
+        now.setattr(Trainer, "_update", lambda self, sampling: (update(self, sampling), self.state.step == 3 and allocate())[0])
         pattern = r"^fit: out of memory( \([^\n]*allocate[^\n]*\))?; --resume goes on from the last checkpoint in [^\n]*\.$"
         with pytest.raises(OutOfMemoryError, match=pattern) as full:
             fit(scene, tmp_path, recipe=QUICK, steps=STEPS, checkpoint_every=0.0)

@@ -176,15 +176,17 @@ def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -
 
 
 def learn(
-    step: Step, ahead: Sequence[Drawing] = (), update: Sequence[AdamPart] = (), meanwhile: Callable[[Learned], None] | None = None
+    step: Step,
+    ahead: Sequence[Drawing] = (),
+    update: Callable[[], Sequence[AdamPart]] | None = None,
+    meanwhile: Callable[[Learned], None] | None = None,
 ) -> Learned:
-    """A step's loss, its gradients, added to ``grad`` of what is learned, and of what these are a step of Adam, see ``AdamPart``: where
-    loss or gradients are not finite nothing moves, and these stay.
+    """A step's loss, its gradients, added to ``grad`` of what is learned, and a step of Adam. Python has its time beside the kernels.
 
     Args:
         ahead: what is drawn beside it, two drawings at the most.
-        meanwhile: called with what was learned before anything moves or, where there are cores for both, while it does: the sum of the
-            gradients may not be known then.
+        update: gives what moves by its gradient, which is cleared; where the loss or a gradient is not finite nothing moves, and they stay.
+        meanwhile: called with what was learned, before or while that moves: the sum of all gradients may not be known then.
     """
     backend = _backend(step.rays.origins)
     if backend is cpu:
@@ -193,9 +195,10 @@ def learn(
     learned = learned._replace(drawn=tuple(draw(*drawing) for drawing in ahead))
     if meanwhile is not None:
         meanwhile(learned)
-    if update and math.isfinite(learned.loss) and math.isfinite(learned.gradients):
-        for part in update:
-            adam(*part)
+    if update is not None and math.isfinite(learned.loss) and math.isfinite(learned.gradients):
+        with torch.no_grad():
+            for part in update():
+                adam(*part)
     return learned
 
 

@@ -172,13 +172,18 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _work(  # type: ignore[no-untyped-def]
-    worker, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
-    measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
-    g_gain,
+def learn_rays(  # type: ignore[no-untyped-def]
+    next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured, gain,
+    opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
-    """Take chunks of rays, then points, and then rays of the next step to draw, until there are none."""
-    total, points = rays.origins.shape[0], eikonal.points.shape[0]
+    """See ``learning.learn``: what it leaves per chunk, ``finish`` adds up. Chunks of rays, then points, and then rays of the next step to
+    draw, until no task is left.
+
+    next_task: (2,), the second number counts threads, each of which has a slot of its own in the stores.
+    surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
+    there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: see ``to_draw``.
+    """
+    worker, total, points = take(next_task, 1), rays.origins.shape[0], eikonal.points.shape[0]
     chunks = (total + CHUNK - 1) // CHUNK
     asked = points + (total if len(lamps.position) else len(eikonal.noise))
     while True:
@@ -208,22 +213,17 @@ def _work(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def learn_rays(  # type: ignore[no-untyped-def]
+def learn_rays_together(  # type: ignore[no-untyped-def]
     threads, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
     measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
     g_gain,
 ):  # fmt: skip
-    """See ``learning.learn``: what it leaves per chunk, ``finish`` adds up.
-
-    surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
-    there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: see ``to_draw``.
-    """
-    next_task[0] = 0
-    for worker in prange(threads):
-        _work(
-            np.int64(worker), next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps,
-            far_light, view, measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples,
-            squared, mirrored, g_mirrored, g_gain,
+    """``learn_rays``, by so many threads."""
+    for _ in prange(threads):
+        learn_rays(
+            next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
+            measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
+            g_mirrored, g_gain,
         )  # fmt: skip
 
 

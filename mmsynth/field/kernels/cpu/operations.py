@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from numba import get_num_threads, set_num_threads
+from numba import get_num_threads
 from torch import Tensor
 
 from mmsynth.field.kernels import reference
@@ -37,7 +37,7 @@ from mmsynth.field.kernels.cpu.stores import (
     tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
-from mmsynth.field.kernels.cpu.tasks import beside
+from mmsynth.field.kernels.cpu.tasks import take_beside
 from mmsynth.field.kernels.learning import gradient_of, no_light
 from mmsynth.field.kernels.parameters import (
     AdamPart,
@@ -304,7 +304,10 @@ class _Mirror(torch.autograd.Function):
 
 @torch.no_grad()
 def learn(
-    step: Step, ahead: Sequence[Drawing] = (), update: Sequence[AdamPart] = (), meanwhile: Callable[[Learned], None] | None = None
+    step: Step,
+    ahead: Sequence[Drawing] = (),
+    update: Callable[[], Sequence[AdamPart]] | None = None,
+    meanwhile: Callable[[Learned], None] | None = None,
 ) -> Learned:
     """See ``kernels.learn`` and ``learning.learn``; float32, ``measured.ray`` never decreasing."""
     grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
@@ -330,52 +333,43 @@ def learn(
     out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
     squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
     g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
-    next_task = np.zeros(1, np.int64)
     to_fill = [to_draw(drawing) for drawing in ahead]
     first, second = (*(arrays for arrays, _ in to_fill), nothing_to_draw(), nothing_to_draw())[:2]
     table, look = _arrays(grid), _arrays(appearance)
-    learning.learn_rays(
-        threads, next_task, _arrays(rays), _array(states), _in_double(sampling), table, surface_layers(_arrays(network)), look,
+    to_learn = (
+        np.zeros(2, np.int64), _arrays(rays), _array(states), _in_double(sampling), table, surface_layers(_arrays(network)), look,
         *_shader_layers(_arrays(shader)), two_layers(*shining[:4]), lamps, _array(far_light), _arrays(view), _arrays(measured), gain,
         _arrays(opacities), _arrays(eikonal), first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays,
         out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
-    shines = len(used) > 0
-    learned = (*network[:2], *shader, *(light[:6] if shines else no_light("cpu")[:6]), far_light)
-    gradients = WeightGradients(*(gradient_of(x).numpy() for x in learned))
-    loss, sums = out.arrays.loss[:tasks].sum(), np.zeros(2)
+    sums, done = np.zeros(2), np.zeros(1 + grid.active + appearance.active, np.int64)
+
+    def to_finish() -> tuple[Any, ...]:
+        learned = (*network[:2], *shader, *(light[:6] if len(used) else no_light("cpu")[:6]), far_light)
+        gradients = WeightGradients(*(gradient_of(x).numpy() for x in learned))
+        of_levels: dict[int, tuple[Any, int]] = {
+            grid.table.data_ptr(): (table.offsets[: grid.active + 1], 1),
+            appearance.table.data_ptr(): (look.offsets[: appearance.active + 1], 1 + grid.active),
+        }
+        return (
+            np.zeros(1, np.int64), done, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used,
+            lamps.spectrum, gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy(), gradients, sums,
+            *places_and_numbers(update() if update is not None else (), of_levels),
+        )  # fmt: skip
+
+    finish = take_beside(to_finish, threads, learning.learn_rays, learning.learn_rays_together, to_learn)
+    loss = sums[0] = out.arrays.loss[:tasks].sum()
     if len(gain):
         by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
         of_gains = by_frame - by_frame.mean()
         gradient_of(gains.log_gain).numpy()[...] += of_gains.astype(np.float32)
         sums[1] = of_gains.sum()
-    sums[0] = loss
     found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
     result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(drawn for _, drawn in to_fill))
-    of_levels: dict[int, tuple[Any, int]] = {
-        grid.table.data_ptr(): (table.offsets[: grid.active + 1], 1),
-        appearance.table.data_ptr(): (look.offsets[: appearance.active + 1], 1 + grid.active),
-    }
-    next_task[0], done = 0, np.zeros(1 + grid.active + appearance.active, np.int64)
-    to_do = (
-        next_task, done, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used, lamps.spectrum,
-        gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy(), gradients, sums, *places_and_numbers(update, of_levels),
-    )  # fmt: skip
-    others = beside(_finish, threads - 1, to_do) if threads > 1 else None
-    try:
+
+    def then() -> None:
         if meanwhile is not None:
             meanwhile(result)
-    finally:
-        learning.finish(*to_do)
-        if others is not None:
-            others.result()
+
+    take_beside(then, threads, learning.finish, learning.finish_together, finish)
     return result
-
-
-def _finish(threads: int, to_do: tuple[Any, ...]) -> None:
-    """So many threads take the tasks of ``learning.finish``."""
-    if threads == 1:
-        learning.finish(*to_do)
-        return
-    set_num_threads(threads)
-    learning.finish_together(threads, *to_do)

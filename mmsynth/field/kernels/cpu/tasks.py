@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
+
+T = TypeVar("T")
 
 
 @intrinsic
@@ -56,8 +58,31 @@ _threads: list[ThreadPoolExecutor] = []
 os.register_at_fork(after_in_child=_threads.clear)
 
 
-def beside(call: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Call it in a thread of its own, which stays."""
+def take_beside(
+    meanwhile: Callable[[], T], threads: int, alone: Callable[..., None], together: Callable[..., None], arguments: tuple[Any, ...]
+) -> T:
+    """What ``meanwhile`` gives, which a thread of its own does beside the tasks of a kernel; then it takes such tasks, too.
+
+    alone: the kernel, until no task is left. together: the same by so many threads, its first argument.
+    """
+    if threads == 1:
+        result = meanwhile()
+        alone(*arguments)
+        return result
     if not _threads:
-        _threads.append(ThreadPoolExecutor(1, "kernels"))
-    return _threads[0].submit(call, *arguments)
+        _threads.append(ThreadPoolExecutor(1, "beside"))  # it stays: starting one takes as long as what it does
+
+    def first_meanwhile() -> T:
+        result = meanwhile()
+        alone(*arguments)
+        return result
+
+    other = _threads[0].submit(first_meanwhile)
+    try:
+        if threads == 2:
+            alone(*arguments)
+        else:
+            together(threads - 1, *arguments)
+    finally:
+        result = other.result()
+    return result
