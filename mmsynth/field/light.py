@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -46,7 +47,12 @@ class Light(nn.Module):
     @property
     def count(self) -> int:
         """How many lamps there are, K."""
-        return int(self.used.sum())
+        return int(np.count_nonzero(self._used))
+
+    @property
+    def _used(self) -> np.ndarray:
+        """As an array: NumPy is quicker with so few, and a step of a fit asks."""
+        return self.used.numpy(force=True)
 
     def add(self, positions: Tensor) -> None:
         """Lamps as bright as the scene, seen from all surfaces, at (K, 3), in the first K free places."""
@@ -71,7 +77,8 @@ class Light(nn.Module):
     def network(self) -> LightNetwork:
         """What a step of a fit takes."""
         weights = self.first.weight, self.first.bias, self.second.weight, self.second.bias
-        return LightNetwork(*weights, self.position, self.log_spectrum, torch.nonzero(self.used)[:, 0])
+        used = torch.from_numpy(np.flatnonzero(self._used)).to(self.used.device)
+        return LightNetwork(*weights, self.position, self.log_spectrum, used)
 
     def lamps(self) -> Lamps:
         """What the kernels take."""

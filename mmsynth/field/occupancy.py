@@ -12,7 +12,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from mmsynth.field.kernels import OUTSIDE, SHELL, SOLID
+from mmsynth.field import kernels
+from mmsynth.field.kernels import SHELL, Cells, GridTable, SurfaceNetwork, reference
 
 
 class Occupancy(nn.Module):
@@ -27,29 +28,30 @@ class Occupancy(nn.Module):
 
     @torch.no_grad()
     def update(
-        self, sdf: Callable[[Tensor], Tensor], sharpness: float, generator: torch.Generator, share: float, slack: float = 1.5
+        self,
+        sdf: Callable[[Tensor], Tensor] | tuple[GridTable, SurfaceNetwork],
+        sharpness: float,
+        generator: torch.Generator,
+        share: float,
+        slack: float = 1.5,
     ) -> bool:
         """Classify all shell cells and a ``share`` of the others, every n-th from a random one on, anew.
 
         Args:
-            sdf: (N, 3) → (N,). slack: how far |∇sdf| may exceed 1 (it does while training).
+            sdf: (N, 3) → (N,), or what ``kernels.surface_value`` takes of a surface.
+            slack: how far |∇sdf| may exceed 1 (it does while training).
         Returns:
             False when no shell was left and the whole grid was opened again: nothing to see, worth a report.
         """
-        grid = self.states.shape[0]
-        flat = self.states.view(-1)
-        every = max(1, round(1.0 / share))
+        grid, every = self.states.shape[0], max(1, round(1.0 / share))
         first = int(torch.randint(every, (1,), generator=generator))
-        again = torch.arange(first, flat.shape[0], every, device=flat.device)
-        cells = again if every == 1 else torch.cat([torch.nonzero(flat == SHELL)[:, 0], again])
-        index = torch.stack([cells // (grid * grid), cells // grid % grid, cells % grid], -1)
         margin = slack * self.extent * 3**0.5 / grid + 5.0 / sharpness
-        for part in torch.arange(len(cells), device=cells.device).split(65536):
-            value = sdf(((index[part].float() + 0.5) * (2.0 / grid) - 1.0) * self.extent)
-            free = (value - margin) * (grid / (self.extent * slack))
-            state = torch.where(value > margin, OUTSIDE + free.clamp(0, 253 - OUTSIDE), torch.where(value < -margin, SOLID, SHELL))
-            flat[cells[part]] = state.to(torch.uint8)
-        if bool((flat == SHELL).any()):
+        cells = Cells(self.extent, every, first, margin, grid / (self.extent * slack))
+        if callable(sdf):
+            reference.classify(self.states, cells, sdf)
+        else:
+            kernels.classify(self.states, cells, *sdf)
+        if bool((self.states == SHELL).any()):
             return True
-        flat.fill_(SHELL)
+        self.states.fill_(SHELL)
         return False

@@ -58,6 +58,7 @@ def run_kernels() -> None:
         )  # fmt: skip
         kernels.learn(step)
     with torch.no_grad():
+        kernels.classify(Occupancy(4).states, kernels.Cells(1.0, 1, 0, 0.1, 2.0), *surface.at(1))
         kernels.shade(weights, hits.features, directions, 0)
     _draw()
     parameter, gradient, first, second = torch.zeros(4, 1)

@@ -220,9 +220,8 @@ def _finished(trainer: Trainer) -> Field:
     field = trainer.field
     trainer.average.apply()
     field.sampling = _rendered_sampling(trainer)
-    field.occupancy.update(
-        lambda x: field.surface(x, field.sampling.active_surface), field.sampling.sharpness, torch.Generator().manual_seed(0), 1.0
-    )
+    surface, sharpness = field.surface.at(field.sampling.active_surface), field.sampling.sharpness
+    field.occupancy.update(surface, sharpness, torch.Generator().manual_seed(0), 1.0)
     field.corrections = trainer.refinement.corrections()
     field.rig = {n: pose @ field.corrections.sensors.get(n, np.eye(4)) for n, pose in field.rig.items()}
     return field

@@ -22,7 +22,8 @@ def opacities(batch: Batch, outside: int, has_opacity: bool, black_background: b
     """
     loss, rays, none = recipe.loss, len(batch.origins), batch.ray_weight.new_zeros
     if not (has_opacity or black_background):
-        return kernels.Opacities(none(0), none(0), none(0), none(0), 0.0)
+        nothing = none(0)
+        return kernels.Opacities(nothing, nothing, nothing, nothing, 0.0)
     target, weight, linear, blocked = (none(rays + outside) for _ in range(4))
     weight[rays:] = loss.alpha_weight / max(outside, 1)
     solid = blocked_weight(is_early(progress, recipe), recipe)

@@ -212,8 +212,7 @@ class Trainer:
         state, schedule, field = self.state, self.recipe.schedule, self.field
         if state.step % self.recipe.sampling.occupancy_every == 0:
             share = 1.0 if state.step == 0 else 1 / 16
-            sdf = lambda x: field.surface(x, sampling.active_surface)
-            if not field.occupancy.update(sdf, sampling.sharpness, generator, share):
+            if not field.occupancy.update(field.surface.at(sampling.active_surface), sampling.sharpness, generator, share):
                 state.reopened += 1
         if state.step % _RENEW_EVERY == 0:
             self.importance.renew()

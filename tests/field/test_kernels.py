@@ -409,6 +409,39 @@ def test_is_compiled_says_so() -> None:
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout == "True\n"
 
 
+# --- cells of the three-state grid
+
+
+@pytest.mark.parametrize("extent", [1.0, 2.0])
+@pytest.mark.parametrize("share", [1.0, 1 / 16, 1 / 3])
+@pytest.mark.parametrize("grid", [3, 5, 32, 40])  # the last two: more than one task
+def test_cells_are_those_of_the_definition(extent: float, share: float, grid: int) -> None:
+    """To the bit, while the surface moves, and by any number of threads."""
+    surface, *_ = _parts(extent, "shell", 4)
+    ours, theirs, alone = (Occupancy(grid, extent) for _ in range(3))
+    before = numba.get_num_threads()
+    for step, sharpness in enumerate((20.0, 60.0, 400.0, 90.0)):
+        with torch.no_grad():
+            surface.grid.table.mul_(0.8)
+        at = [torch.Generator().manual_seed(step) for _ in range(3)]
+        open_ = theirs.update(lambda x: surface(x, 3), sharpness, at[0], share)
+        assert ours.update(surface.at(3), sharpness, at[1], share) == open_
+        numba.set_num_threads(1)
+        alone.update(surface.at(3), sharpness, at[2], share)
+        numba.set_num_threads(before)
+        assert torch.equal(ours.states, theirs.states) and torch.equal(alone.states, theirs.states)
+    assert grid < 32 or len(ours.states.unique()) > 5
+
+
+def test_a_cell_whose_distance_is_not_a_number_stays_open() -> None:
+    surface, *_ = _parts(1.0, "shell", 4)
+    with torch.no_grad():
+        surface.output_weight[-1] = torch.nan
+    occupancy = Occupancy(8)
+    assert occupancy.update(surface.at(3), 50.0, torch.Generator().manual_seed(0), 1.0)
+    assert (occupancy.states == SHELL).all()
+
+
 # --- Adam
 
 

@@ -25,6 +25,7 @@ from mmsynth.field.kernels.parameters import (
     AdamPart,
     AdamStep,
     Cameras,
+    Cells,
     Drawing,
     Drawn,
     Eikonal,
@@ -59,6 +60,7 @@ __all__ = [
     "AdamPart",
     "AdamStep",
     "Cameras",
+    "Cells",
     "Drawing",
     "Drawn",
     "Eikonal",
@@ -85,6 +87,7 @@ __all__ = [
     "Surroundings",
     "View",
     "adam",
+    "classify",
     "compare",
     "contract",
     "contracted_velocity",
@@ -141,6 +144,14 @@ def hash_encode(positions: Tensor, table: Tensor, resolutions: Tensor, offsets: 
 def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
     """Signed distances of positions."""
     return _backend(positions).surface_value(positions, grid, network)
+
+
+def classify(states: Tensor, cells: Cells, grid: GridTable, network: SurfaceNetwork) -> None:
+    """States of the cells of a three-state grid, in place, by a surface."""
+    if _backend(network.hidden) is cpu:
+        cpu.classify(states, cells, grid, network)
+        return
+    reference.classify(states, cells, lambda positions: surface_value(positions, grid, network))
 
 
 def march(sdf: Callable[[Tensor], Tensor], rays: Rays, states: Tensor, extent: float, sampling: Sampling) -> Samples:

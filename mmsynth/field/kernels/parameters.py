@@ -28,6 +28,21 @@ class GridTable(NamedTuple):
     active: int
 
 
+class Cells(NamedTuple):
+    """Which cells of a three-state grid over [-extent, extent]³ are looked at, and what the distance at a cell's centre says of it.
+
+    Attributes:
+        every, first: of those that are certified every n-th, from one on; all that are not. margin: beyond it no surface is in the cell.
+        halves: half cells that are free around it for each unit of distance beyond that.
+    """
+
+    extent: float
+    every: int
+    first: int
+    margin: float
+    halves: float
+
+
 class SurfaceNetwork(NamedTuple):
     """One hidden layer above a grid, and the spheres that are the surface at the start.
 

@@ -24,6 +24,7 @@ from mmsynth.field.kernels.constants import (
     MAX_SAMPLES_PER_RAY,
     NO_CROSSING,
     OUTSIDE,
+    SHELL,
     SOFT_SURFACE,
     SOLID,
 )
@@ -32,6 +33,7 @@ from mmsynth.field.kernels.drawing import odds as odds
 from mmsynth.field.kernels.mirroring import mirror as mirror
 from mmsynth.field.kernels.parameters import (
     AdamStep,
+    Cells,
     GridTable,
     Hits,
     Rays,
@@ -139,6 +141,23 @@ def _advance(
     t = torch.where(entered, t + jitter * step / speed, t)
     points = origins + directions * t[:, None]
     return t, contract(points) if extent > 1 else points, reach, speed, state
+
+
+def classify(states: Tensor, cells: Cells, sdf: Callable[[Tensor], Tensor]) -> None:
+    """States of the cells that are looked at, by the distance at their centres: shell, solid, or outside, with how far it is free.
+
+    Args:
+        states: (G, G, G) uint8, changed in place. sdf: (N, 3) → (N,).
+    """
+    grid, flat = states.shape[0], states.view(-1)
+    again = torch.arange(cells.first, flat.shape[0], cells.every, device=flat.device)
+    looked_at = again if cells.every == 1 else torch.cat([torch.nonzero(flat == SHELL)[:, 0], again])
+    for part in looked_at.split(65536):
+        index = torch.stack([part // (grid * grid), part // grid % grid, part % grid], -1)
+        value = sdf(((index.float() + 0.5) * (2.0 / grid) - 1.0) * cells.extent)
+        free = ((value - cells.margin) * cells.halves).clamp(0, 253 - OUTSIDE)
+        state = torch.where(value > cells.margin, OUTSIDE + free, torch.where(value < -cells.margin, SOLID, SHELL))
+        flat[part] = state.to(torch.uint8)
 
 
 def march(

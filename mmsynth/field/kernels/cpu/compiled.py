@@ -9,7 +9,7 @@ from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, op
 from mmsynth.field.kernels.cpu.caching import remove_old_versions
 
 KERNELS = (
-    surface.surface_forward, surface.surface_backward, surface.surface_scatter,
+    surface.surface_forward, surface.surface_backward, surface.surface_scatter, surface.classify,
     marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
     shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward,
     learning.learn_rays, learning.finish, drawing.draw_rays, drawing.fill_odds, optimiser.adam_tensor,

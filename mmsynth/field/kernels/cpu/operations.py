@@ -41,6 +41,7 @@ from mmsynth.field.kernels.cpu.tasks import take_beside
 from mmsynth.field.kernels.learning import gradient_of, no_light
 from mmsynth.field.kernels.parameters import (
     AdamPart,
+    Cells,
     Drawing,
     GridTable,
     Hits,
@@ -142,6 +143,17 @@ class _Value(torch.autograd.Function):
             surface.surface_scatter(count, table, arrays, gradient_of(grid.table).numpy())
         ctx.store = None
         return None, positions, None, None, *_summed(arrays, -(-count // POINTS), hidden)
+
+
+def classify(states: Tensor, cells: Cells, grid: GridTable, network: SurfaceNetwork) -> None:
+    """See ``reference.classify``, of a surface; float32."""
+    threads, side = get_num_threads(), states.shape[0]
+    store = surface_store(threads, len(network.hidden), len(grid.resolutions))
+    centre = ((torch.arange(side) + 0.5) * (2.0 / side) - 1.0) * cells.extent
+    surface.classify(
+        threads, np.zeros(2, np.int64), states.view(-1).numpy(), centre.numpy(), _arrays(cells), _arrays(grid),
+        surface_layers(_arrays(network)), store.arrays,
+    )  # fmt: skip
 
 
 def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:

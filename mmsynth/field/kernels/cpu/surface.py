@@ -5,14 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numba import get_thread_id, njit, prange
 
+from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.cpu.blocks import (
     scatter_block,
     surface_block,
     surface_block_backward,
     surface_block_positions,
 )
+from mmsynth.field.kernels.cpu.tasks import take
 
 POINTS = 128  # positions of a block
+_CELLS = 8192  # of a task
+_f = np.float32
+_ZERO, _ONE, _MOST = _f(0.0), _f(1.0), _f(253 - OUTSIDE)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -64,3 +69,48 @@ def surface_scatter(count, grid, store, gradient):  # type: ignore[no-untyped-de
         level = np.int64(task)  # unsigned otherwise, and the block would be compiled twice
         for chunk in range((count + POINTS - 1) // POINTS):
             scatter_block(store.block[chunk], np.int64(min(POINTS, count - chunk * POINTS)), grid, gradient, level)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _classify_block(n, where, states, cells, grid, layers, block, hidden, value):  # type: ignore[no-untyped-def]
+    """States of n cells, whose centres the block holds."""
+    surface_block(block, hidden, value, n, grid, layers)
+    for i in range(n):
+        if value[i] > cells.margin:
+            states[where[i]] = np.uint8(_f(OUTSIDE) + min(max((value[i] - cells.margin) * cells.halves, _ZERO), _MOST))
+        else:
+            states[where[i]] = np.uint8(SOLID if value[i] < -cells.margin else SHELL)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _classify_cells(next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
+    """Take tasks until there are none."""
+    slot, side, n = take(next_task, 1), len(centre), 0
+    block, hidden = store.block[slot], store.hidden[slot]
+    where, value = np.empty(POINTS, np.int64), np.empty(POINTS, np.float32)
+    while True:
+        begin = take(next_task, 0) * _CELLS
+        if begin >= len(states):
+            break
+        again = cells.first + (begin - cells.first + cells.every - 1) // cells.every * cells.every  # the next that is looked at anyway
+        for cell in range(begin, min(begin + _CELLS, len(states))):
+            if cell == again:
+                again += cells.every
+            elif states[cell] != SHELL:
+                continue
+            block[n, 0], block[n, 1], block[n, 2] = centre[cell // (side * side)], centre[cell // side % side], centre[cell % side]
+            block[n, 3] = _ONE
+            where[n] = cell
+            n += 1
+            if n == POINTS:
+                _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
+                n = 0
+    _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def classify(threads, next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
+    """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. next_task: (2,), see ``learn_rays``. store: a slot
+    for each thread."""
+    for _ in prange(threads):
+        _classify_cells(next_task, states, centre, cells, grid, layers, store)
