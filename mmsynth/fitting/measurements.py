@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -129,6 +130,11 @@ class Measurements(Mapping[str, Modality]):
             all_frames[first : first + len(own)] = torch.from_numpy(own)
 
 
+@functools.lru_cache(maxsize=8)
+def _integers(values: tuple[int, ...], device: torch.device) -> Tensor:
+    return torch.tensor(values, dtype=torch.int32, device=device)
+
+
 def drawing_of(
     measurements: Measurements,
     columns: Mapping[str, slice] | None,
@@ -139,8 +145,8 @@ def drawing_of(
     """What kernels draw for a random batch, see ``draw``."""
     modalities = measurements.modalities
     if columns is not None:
-        output = torch.tensor([columns[n].start if n in rays else 0 for n in measurements.order], dtype=torch.int32)
-        modalities = modalities._replace(output=output.to(modalities.output.device))
+        begins = tuple(columns[n].start if n in rays else 0 for n in measurements.order)
+        modalities = modalities._replace(output=_integers(begins, modalities.output.device))
     first, second = random.integers(0, 1 << 32, 2).tolist()
     return kernels.Drawing(
         measurements.frames, measurements.cameras, modalities, measurements.chosen if selection is None else selection,

@@ -46,12 +46,13 @@ def eikonal_points(recipe: Recipe, shines: bool) -> tuple[int, int]:
     return count // 4, 0 if shines else count - count // 4
 
 
-def eikonal(field: Field, sampling: kernels.Sampling, recipe: Recipe, progress: float, generator: torch.Generator) -> kernels.Eikonal:
-    """Where the distance is pulled towards a true one: a quarter of the points in all space, the others within the soft surface, or at
-    all surfaces that rays meet where these shine, whose normals are known."""
+def eikonal(
+    field: Field, sampling: kernels.Sampling, recipe: Recipe, progress: float, points: torch.Tensor, generator: torch.Generator
+) -> kernels.Eikonal:
+    """Where the distance is pulled towards a true one: in all space (``points``, a quarter of all), and within the soft surface, or at all
+    surfaces that rays meet where these shine, whose normals are known."""
     grid = field.surface.grid
-    free, near = eikonal_points(recipe, field.shines)
-    points = (torch.rand(free, 3, generator=generator) * 2 - 1) * grid.extent
+    _, near = eikonal_points(recipe, field.shines)
     noise = torch.randn(near, 3, generator=generator) * (3.0 / sampling.sharpness)
     cell = grid.cell(sampling.active_surface)
     shallow = shallow_factor(is_early(progress, recipe), recipe)

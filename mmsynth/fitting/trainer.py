@@ -35,7 +35,7 @@ from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, samples_of_step, sampling_at, surface_rate_factor
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
-from mmsynth.fitting.terms import eikonal, opacities
+from mmsynth.fitting.terms import eikonal, eikonal_points, opacities
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
 
@@ -99,6 +99,7 @@ class Trainer:
             self.state.rays = max(self.state.rays, self.on_device.first_rays)
         self.prepared: tuple[Any, ...] = ()  # of the last step on the device, what was then
         self.coming: DrawnStep | None = None
+        self.points, _ = eikonal_points(recipe, shines=False)  # of all space, whether it shines or not
         self.random_ahead = 0, self._random(0)  # of a step, made beside the kernels of one before
         self.parts: dict[str, Any] = {
             "field": self.field,
@@ -251,11 +252,11 @@ class Trainer:
         counts = {n: max(1, int(rays * share / total)) for n, share in self.needs.share.items()}
         of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, self.importance.selection)
         if not self.has_empty:
-            return ToDraw(counts, (of_pixels,), generator)
+            return ToDraw(counts, (of_pixels,), self.points, generator)
         # rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the object's, or
         # of a picture that was painted white there: they are not looked at
         outside = {name: -(-count // _OUTSIDE) for name, count in counts.items()}
-        return ToDraw(counts, (of_pixels, empty_drawing_of(self.measurements, outside, random)), generator)
+        return ToDraw(counts, (of_pixels, empty_drawing_of(self.measurements, outside, random)), self.points, generator)
 
     def _wrong(self, learned: kernels.Learned) -> str | None:
         """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
@@ -306,7 +307,7 @@ class Trainer:
             field.shader.weights(), light, far_light, rays, kernels.View(degrees, trains), batch.measured,
             kernels.Gains(log_gain, batch.frame),
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
-            eikonal(field, sampling, self.recipe, self.progress, drawn.generator), sampling,
+            eikonal(field, sampling, self.recipe, self.progress, drawn.points, drawn.generator), sampling,
         )  # fmt: skip
         return kernels.learn(step, ahead, update, meanwhile)
 

@@ -24,7 +24,7 @@ from mmsynth.field.rendering import interval
 from mmsynth.field.storage import load_field
 from mmsynth.field.warmup import warm_up
 from mmsynth.fitting import run as run_module
-from mmsynth.fitting.ahead import DrawnStep
+from mmsynth.fitting.ahead import DrawnStep, drawn_step
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.device import pick_device
 from mmsynth.fitting.measurements import draw, load_measurements
@@ -413,7 +413,8 @@ def test_a_fit_of_nothing_but_bad_steps_gives_up(scene: Scene, tmp_path: Path) -
 def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     trainer.recipe = _recipe(**changes)
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
-    drawn = DrawnStep(batch, _rays(trainer, batch), torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    drawn = DrawnStep(batch, _rays(trainer, batch), torch.rand(256, 3, generator=generator) * 2 - 1, generator)
     return float(trainer._learn(drawn, sampling).loss)
 
 
@@ -519,7 +520,9 @@ def test_alpha_premultiplies_colours_and_becomes_opacity(write_transforms: Calla
 def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, background: str) -> None:
     trainer = _trainer(scene, **{"surface.background": background})
     sampling = sampling_at(0.0, trainer.recipe, trainer.needs)
-    asked = eikonal(trainer.field, sampling, trainer.recipe, 0.0, torch.Generator().manual_seed(0))
+    to_draw = trainer._to_draw(0, 64)
+    drawn = drawn_step(trainer.field, trainer.measurements, to_draw, [kernels.draw(*drawing) for drawing in to_draw.drawings])
+    asked = eikonal(trainer.field, sampling, trainer.recipe, 0.0, drawn.points, drawn.generator)
     grid = trainer.field.surface.grid
     assert grid.extent == (2.0 if background == "on" else 1.0)
     assert asked.points.shape == (32, 3) and asked.noise.shape == (96, 3)
