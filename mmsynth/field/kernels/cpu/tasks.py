@@ -55,7 +55,8 @@ def wait(flags, index):  # type: ignore[no-untyped-def]
 
 
 _threads: list[ThreadPoolExecutor] = []
-os.register_at_fork(after_in_child=_threads.clear)
+if hasattr(os, "register_at_fork"):  # Unix: a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_threads.clear)
 
 
 def take_beside(
