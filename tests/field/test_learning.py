@@ -75,17 +75,17 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
     }
 
 
-def _told(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Step, dict[str, nn.Parameter]]:
-    """A step as kernels take it, and all that is learned by name."""
+def _told(step: dict[str, Any], dtype: torch.dtype, active: int = 3) -> tuple[kernels.Step, dict[str, nn.Parameter]]:
+    """A step as kernels take it, of so many levels of three, and all that is learned by name."""
     modules = {n: m.to(dtype) for n, m in step.items() if isinstance(m, nn.Module)}
     for m in modules.values():
         m.zero_grad()
     cast = lambda x: x.to(dtype) if isinstance(x, Tensor) and x.is_floating_point() else x
     tuples = {n: type(x)(*map(cast, x)) for n, x in step.items() if isinstance(x, tuple)}
     far_light, log_gain = (nn.Parameter(x.detach().to(dtype)) for x in (step["far_light"], step["gains"].log_gain))
-    grid, network = modules["surface"].at(3)
+    grid, network = modules["surface"].at(active)
     told = kernels.Step(
-        grid, network, modules["appearance"].at(3), step["states"], modules["shader"].weights(), modules["light"].network(), far_light,
+        grid, network, modules["appearance"].at(active), step["states"], modules["shader"].weights(), modules["light"].network(), far_light,
         tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
         tuples["eikonal"], step["sampling"],
     )  # fmt: skip
@@ -167,28 +167,29 @@ def _parts(parameters: dict[str, nn.Parameter]) -> list[kernels.AdamPart]:
     return [kernels.AdamPart(p, learning.gradient_of(p), *moments[n], steps[n]) for n, p in parameters.items()]
 
 
-def _with_update(step: dict[str, Any], dtype: torch.dtype) -> tuple[kernels.Learned, list[Tensor], list[Any]]:
+def _with_update(step: dict[str, Any], dtype: torch.dtype, active: int = 3) -> tuple[kernels.Learned, list[Tensor], list[Any]]:
     """What was learned, parameters, gradients and moments after it, and what was told meanwhile."""
-    told, parameters = _told(step, dtype)
+    told, parameters = _told(step, dtype, active)
     parts, heard = _parts(parameters), list[Any]()
     found = kernels.learn(told, (), lambda: parts, lambda learned: heard.append((learned.loss.clone(), learned.squared.clone())))
     return found, [x.detach().clone() for part in parts for x in part[:4]], heard
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
+@pytest.mark.parametrize("active", [1, 3])
 @pytest.mark.parametrize("case", ["all", "plain"])
-def test_a_step_of_adam_comes_with_it(case: str, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same to the bit as Adam by itself after it, by any number of threads."""
+def test_a_step_of_adam_comes_with_it(case: str, active: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same to the bit as Adam by itself of whole tables after it, by any number of threads."""
     from mmsynth.field.kernels.cpu import operations
 
     monkeypatch.setattr(operations, "get_num_threads", lambda: threads)
-    told, parameters = _told(_step(*CASES[case]), torch.float32)
+    told, parameters = _told(_step(*CASES[case]), torch.float32, active)
     alone, parts = kernels.learn(told), _parts(parameters)
     moved = [bool(part.gradient.any()) for part in parts]
     with torch.no_grad():
         for part in parts:
             kernels.adam(*part)
-    found, after, heard = _with_update(_step(*CASES[case]), torch.float32)
+    found, after, heard = _with_update(_step(*CASES[case]), torch.float32, active)
     assert found.loss == alone.loss and found.gradients == alone.gradients and sum(moved) > 8
     assert all(torch.equal(x, y) for x, y in zip(after, (x.detach() for part in parts for x in part[:4]), strict=True))
     assert not any(x.any() for x in after[1::4])

@@ -1,7 +1,8 @@
 """The operations for float32 on the CPU, fused and compiled by numba; what is not fused is the reference's.
 
 Begin with ``operations``, the autograd functions; the kernels are in ``blocks`` (what all are made of), ``surface``, ``marching`` and
-``tracing_gradients``, ``shading``, ``mirroring``, ``drawing`` and ``optimiser``.
+``tracing_gradients``, ``shading``, ``mirroring``, ``drawing``, ``optimiser`` and, all together in a step of a fit, ``learning``; ``tasks``
+is how threads share them.
 """
 
 from pathlib import Path

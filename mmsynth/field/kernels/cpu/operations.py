@@ -378,10 +378,6 @@ def learn(
         sums[1] = of_gains.sum()
     found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
     result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(drawn for _, drawn in to_fill))
-
-    def then() -> None:
-        if meanwhile is not None:
-            meanwhile(result)
-
-    take_beside(then, threads, learning.finish, learning.finish_together, finish)
+    tell = meanwhile or (lambda _: None)
+    take_beside(lambda: tell(result), threads, learning.finish, learning.finish_together, finish)
     return result

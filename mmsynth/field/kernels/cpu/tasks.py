@@ -66,18 +66,16 @@ def take_beside(
 
     alone: the kernel, until no task is left. together: the same by so many threads, its first argument.
     """
-    if threads == 1:
-        result = meanwhile()
-        alone(*arguments)
-        return result
-    if not _threads:
-        _threads.append(ThreadPoolExecutor(1, "beside"))  # it stays: starting one takes as long as what it does
 
     def first_meanwhile() -> T:
         result = meanwhile()
         alone(*arguments)
         return result
 
+    if threads == 1:
+        return first_meanwhile()
+    if not _threads:
+        _threads.append(ThreadPoolExecutor(1, "beside"))  # it stays: starting one takes as long as what it does
     other = _threads[0].submit(first_meanwhile)
     try:
         if threads == 2:
