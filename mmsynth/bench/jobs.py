@@ -2,7 +2,8 @@
 
 A result lies in ``OUT/rows/<name>-<digest>.json``, and the digest is that of everything the result depends on (``identity``): pixels,
 poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result on disk is never out of date, and a
-benchmark that was interrupted continues where it was.
+benchmark that was interrupted continues where it was, in the middle of a fit, too: until there is a result, ``OUT/fits/<name>-<digest>`` is
+the run folder.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -123,11 +125,17 @@ def scene_hashes(jobs: Sequence[Job]) -> dict[str, str]:
 def result_of(job: Job, scene: str, out: Path) -> dict[str, Any]:
     """The row of one job, see ``run_jobs``; ``scene``: its ``scene_hash``."""
     path, wanted = _file_of(job, scene, out)
+    run = out / "fits" / path.stem
     if not path.is_file():
         machine = identify()
         about = {"name": job.name, "seed": job.seed, "device": job.device, "cores": machine["cores"], "threads": machine["threads"]}
-        result = run_job(job)
+        try:
+            result = run_job(job, run)
+        except DivergedError:
+            shutil.rmtree(run, ignore_errors=True)  # from its checkpoint it would diverge again
+            raise
         write_json(path, {**about, **result, "mean": mean_over_modalities(result["scores"]), "identity": wanted})
+    shutil.rmtree(run, ignore_errors=True)
     return dict(read_json(path))
 
 
@@ -143,13 +151,16 @@ def _file_of(job: Job, scene: str, out: Path) -> tuple[Path, dict[str, Any]]:
     return out / "rows" / f"{job.name}-{hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:12]}.json", wanted
 
 
-def run_job(job: Job) -> dict[str, Any]:
+def run_job(job: Job, run: Path) -> dict[str, Any]:
     """Fit and score in a fresh process (``mmsynth.bench.worker``).
 
+    Args:
+        run: folder of the fit, which goes on from the checkpoint that it has.
     Raises:
         InputError: the fit was refused or its process died.
+        DivergedError: the fit diverged.
     """
-    return in_a_process("mmsynth.bench.worker", {**job.task(), "began": time.time()}, job.name)
+    return in_a_process("mmsynth.bench.worker", {**job.task(), "run": str(run.resolve()), "began": time.time()}, job.name)
 
 
 def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -166,9 +177,17 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
         # torchrun limits torch alone; numba would take all cores for each of the processes
         if environment.get("OMP_NUM_THREADS", "").isdecimal():
             environment.setdefault("NUMBA_NUM_THREADS", environment["OMP_NUM_THREADS"])
-        # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
-            status = process.wait()
+        # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result. Ctrl-C is for
+        # this process alone (a session of its own): a second signal would not let the child write its checkpoint
+        how: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said, "start_new_session": True}
+        with subprocess.Popen(command, env=environment, **how) as process:
+            assert process.stdin is not None
+            try:
+                status = process.wait()
+            except KeyboardInterrupt:
+                process.stdin.close()
+                process.wait()
+                raise
         if status == 0:
             return read_json(Path(folder) / "result.json")
         said.seek(0)

@@ -55,7 +55,7 @@ METHODS: dict[str, Callable[[Field, Scene, int], trimesh.Trimesh]] = {
 }
 
 
-def work(task: Mapping[str, Any], _: Path) -> dict[str, Any]:
+def work(task: Mapping[str, Any]) -> dict[str, Any]:
     """Mesh a field and score the mesh.
 
     Returns:

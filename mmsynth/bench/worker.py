@@ -1,13 +1,15 @@
 """One fit, measured: the process that ``jobs.run_job`` starts, ``python -m mmsynth.bench.worker TASK FOLDER``.
 
-TASK is the JSON of a ``Job.task`` and ``began``, the time of day at which it was given; the result is written to FOLDER/result.json. The
-process ends when its standard input does, so that the fit of a bench that was killed does not go on beside the next one.
+TASK is the JSON of a ``Job.task``, ``run``, the folder of the fit, and ``began``, the time of day at which it was given; the result is
+written to FOLDER/result.json. The process ends when its standard input does, so that the fit of a bench that was killed does not go on
+beside the next one: a fit ends with a checkpoint, from which it goes on when it is given the same folder again.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -22,6 +24,7 @@ from mmsynth.bench.machine import peak_memory
 from mmsynth.errors import known_error
 from mmsynth.field.warmup import warm_up
 from mmsynth.files import write_json
+from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
@@ -31,15 +34,16 @@ from mmsynth.operations.output.work_partition import local_device
 from mmsynth.prior.prior import load_prior
 
 
-def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def work(task: Mapping[str, Any]) -> dict[str, Any]:
     """Fit and score.
 
     Returns:
-        ``seconds``: of the fit, from files to a field on disk, without loading the compiled kernels. ``steps``. ``rays_per_s,
-        samples_per_s``: of the fit; ``render_rays_per_s``: of the test views. ``cpu_share``: processor time by wall time and threads,
-        lower than usual on a machine that others use, too. ``startup_seconds``: from the command to the end of the first step, imports
-        and kernels included; ``load_seconds``: of it, from files to the first step. ``peak_memory_bytes``: of the process when the fit
-        was done, and on a GPU ``peak_gpu_bytes`` of its tensors. ``scores``: of ``evaluate``.
+        ``seconds``: of the fit, from files to a field on disk, without loading the compiled kernels; ``earlier_seconds``: of it, training
+        of processes before this one, which were interrupted. ``steps``. ``rays_per_s, samples_per_s``: of the fit;
+        ``render_rays_per_s``: of the test views. Of this process alone ``cpu_share``: processor time by wall time and threads, lower than
+        usual on a machine that others use, too; ``startup_seconds``: from the command to the end of the first step, imports and kernels
+        included; ``load_seconds``: of it, from files to the first step; ``peak_memory_bytes``: when the fit was done, and on a GPU
+        ``peak_gpu_bytes`` of its tensors. ``scores``: of ``evaluate``.
     Raises:
         InputError: as ``fit`` and ``evaluate``.
     """
@@ -60,14 +64,18 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
     scene = scene_of(task)
     length = {"steps": task["steps"], "budget": task["budget"], "seed": task["seed"]}
-    run, recipe = folder / "run", Recipe(**task["recipe"])
-    field = fit(scene, run, recipe=recipe, **length, device=device, prior=prior, on_start=loaded, on_step=stepped)
+    run, recipe = Path(task["run"]), Recipe(**task["recipe"])
+    saved = read_checkpoint(run)
+    earlier = 0.0 if saved is None else saved["state"]["elapsed"]
+    field = fit(scene, run, recipe=recipe, **length, device=device, resume=True, prior=prior, on_start=loaded, on_step=stepped)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+    started.setdefault("startup_seconds", time.time() - task["began"])  # no step was left
     peak = peak_memory()
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at, and as it was recorded
     scores = evaluate(field, whole_scene_of(task), views=scene.split.test)
     return {
-        "seconds": seconds,
+        "seconds": earlier + seconds,
+        "earlier_seconds": earlier,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),
         **started,
         "peak_memory_bytes": peak,
@@ -78,19 +86,18 @@ def work(task: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     }
 
 
-def serve(work: Callable[[Mapping[str, Any], Path], dict[str, Any]]) -> None:
-    """Read the arguments, work on the task (in a folder that is thrown away), write the result; an error becomes one sentence and
-    its exit code."""
+def serve(work: Callable[[Mapping[str, Any]], dict[str, Any]]) -> None:
+    """Read the arguments, work on the task, write the result; an error becomes one sentence and its exit code."""
 
     def end_with_the_parent() -> None:
         while os.read(0, 1):
             pass
-        os._exit(1)
+        os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=end_with_the_parent, daemon=True).start()
     task, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
     try:
-        write_json(folder / "result.json", work(task, folder))
+        write_json(folder / "result.json", work(task))
     except Exception as error:
         known = known_error(error, "bench")
         if known is None:

@@ -77,7 +77,9 @@ def bench_size(
     recipe: RecipeOption = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     device: DeviceOption = "cpu",
-    out: Annotated[Path, typer.Option(help="what is there already is neither rendered nor fitted again")] = Path("bench/size"),
+    out: Annotated[
+        Path, typer.Option(help="what is there already is neither rendered nor fitted again, and a fit that was interrupted goes on")
+    ] = Path("bench/size"),
     as_json: JsonOption = False,
 ) -> None:
     """The scene of a run as its field shows it to full-size sensors: error over time, start-up and memory by the size of frames."""

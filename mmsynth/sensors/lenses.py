@@ -29,6 +29,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+_Point = tuple[Tensor, Tensor]  # x, y, (..., N) each
+
 STEEPEST = math.radians(80.0)  # off axis: no Brown-Conrady lens sees farther
 WIDEST = math.pi  # off axis: all that a fisheye could see
 _TABLE = 1025
@@ -36,7 +38,7 @@ _ITERATIONS, _ALL = 30, 4  # of Newton's method; how many all points take: from 
 _AT_REST = 1e-13  # the step of a point that has arrived
 _TOLERANCE = 1e-10  # of the residual, at unit focal length
 _STEP = 0.25  # the most that Newton's method moves at once: it stays on its branch
-_ALONG = (0.25, 0.5, 0.75, 1.0)  # where a ray's way from the axis is looked at for folds
+_ALONG = 16  # places on a ray's way from the axis where folds are looked for, if there may be any
 
 
 def _radial(r2: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,26 +49,32 @@ def _radial(r2: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
     return top / bottom, (d_top * bottom - top * d_bottom) / bottom**2
 
 
+def _distorted(x: Tensor, y: Tensor, k: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Distorted x and y of ideal ones (..., N), and their derivatives ∂x_d/∂x, ∂x_d/∂y = ∂y_d/∂x, ∂y_d/∂y."""
+    p1, p2 = k[..., None, 2], k[..., None, 3]
+    xx, yy = x * x, y * y
+    r2 = xx + yy
+    radial, slope = _radial(r2, k[..., None, :])
+    twice, tangential = 2 * slope, 2 * (p1 * y + p2 * x)
+    both = radial + tangential
+    return (
+        x * both + p2 * r2,
+        y * both + p1 * r2,
+        both + twice * xx + 4 * p2 * x,
+        twice * x * y + 2 * (p1 * x + p2 * y),
+        both + twice * yy + 4 * p1 * y,
+    )
+
+
 def distort(xy: Tensor, k: Tensor) -> Tensor:
     """Ideal (..., N, 2) → distorted (..., N, 2), Brown-Conrady with k (..., 8)."""
-    p1, p2 = k[..., None, 2], k[..., None, 3]
-    x, y = xy.unbind(-1)
-    r2 = x * x + y * y
-    radial = _radial(r2, k[..., None, :])[0]
-    return torch.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
+    return torch.stack(_distorted(xy[..., 0], xy[..., 1], k)[:2], -1)
 
 
 def distort_jacobian(xy: Tensor, k: Tensor) -> Tensor:
     """∂ distorted[i] / ∂ ideal[j] of ``distort``: (..., N, 2, 2)."""
-    p1, p2 = k[..., None, 2], k[..., None, 3]
-    x, y = xy.unbind(-1)
-    radial, slope = _radial(x * x + y * y, k[..., None, :])
-    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    rows = (
-        torch.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], -1),
-        torch.stack([across, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], -1),
-    )
-    return torch.stack(rows, -2)
+    _, _, along, across, down = _distorted(xy[..., 0], xy[..., 1], k)
+    return torch.stack([torch.stack([along, across], -1), torch.stack([across, down], -1)], -2)
 
 
 def fold_radius(k: Tensor) -> Tensor:
@@ -97,7 +105,9 @@ def undistort(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
             point, valid = _undistorted(target, lens)
         point = torch.where(valid[..., None], point, 0.0).to(xy.dtype)
     if xy.requires_grad or k.requires_grad:
-        onward = _solve(distort_jacobian(point, k.detach()), torch.where(valid[..., None], xy - distort(point, k), 0.0))
+        along, across, down = _distorted(point[..., 0], point[..., 1], k.detach())[2:]
+        rest = torch.where(valid[..., None], xy - distort(point, k), 0.0)
+        onward = torch.stack(_solved(along, across, down, rest[..., 0], rest[..., 1]), -1)
         point = point + onward - onward.detach()
     return point, valid
 
@@ -107,44 +117,65 @@ def _undistorted(target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     angles = torch.linspace(0.0, 1.0, _TABLE, dtype=torch.float64, device=lens.device) * torch.atan(limit).clamp(max=STEEPEST)[..., None]
     radii = torch.tan(angles)
     profile = radii * _radial(radii * radii, lens[..., None, :])[0]
-    distance = torch.linalg.vector_norm(target, dim=-1)
-    start = torch.where(torch.isinf(limit)[..., None], distance, _interpolate(distance, profile, radii))
-    point = target * (start / distance.clamp(min=1e-300))[..., None]
+    aim = target[..., 0], target[..., 1]
+    distance = torch.hypot(*aim)
+    start = torch.where(torch.isinf(limit)[..., None], distance, _interpolate(distance, profile, radii)) / distance.clamp(min=1e-300)
+    point = aim[0] * start, aim[1] * start
     for _ in range(_ALL):
-        point, length = _newton(point, target, lens)
+        point, length = _newton(point, aim, lens)
     # most have come to rest; of the others, those that are not far beyond the reach of the lens go on
     index = torch.nonzero((length > _AT_REST) & (distance < 1.5 * profile[..., -1:]), as_tuple=True)
     if len(index[0]):
-        some, aim = point[index][:, None], target[index][:, None]
-        lenses = lens[..., None, :].expand(*target.shape[:-1], lens.shape[-1])[index]
+        some, some_aim = ((x[index][:, None], y[index][:, None]) for x, y in (point, aim))
+        lenses = _at(index, lens, distance)
         for _ in range(_ITERATIONS - _ALL):
-            some, length = _newton(some, aim, lenses)
+            some, length = _newton(some, some_aim, lenses)
             if not bool((length > _AT_REST).any()):
                 break
-        point[index] = some[:, 0]
-    close = torch.linalg.vector_norm(target - distort(point, lens), dim=-1) < _TOLERANCE
-    valid = close & (torch.linalg.vector_norm(point, dim=-1) <= limit[..., None])
+        for values, found in zip(point, some, strict=True):
+            values[index] = found[:, 0]
+    there, reached = _distorted(*point, lens), torch.hypot(*point)
+    valid = (torch.hypot(aim[0] - there[0], aim[1] - there[1]) < _TOLERANCE) & (reached <= limit[..., None])
     if bool(lens[..., 2:4].any()):  # tangential terms may fold, too: the orientation holds all the way from the axis
-        for share in _ALONG:
-            j = distort_jacobian(share * point, lens)
-            valid &= j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0] > 0
-    return point, valid
+        index = torch.nonzero(valid & (reached > _upright(radii, lens)[..., None]), as_tuple=True)
+        if len(index[0]):
+            x, y, lenses = point[0][index][:, None], point[1][index][:, None], _at(index, lens, distance)
+            for share in torch.linspace(0.0, 1.0, _ALONG + 1)[1:].tolist():
+                _, _, along, across, down = _distorted(share * x, share * y, lenses)
+                valid[index] &= (along * down - across * across > 0)[:, 0]
+    return torch.stack(point, -1), valid
 
 
-def _newton(point: Tensor, target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
+def _at(index: tuple[Tensor, ...], lens: Tensor, points: Tensor) -> Tensor:
+    """The lenses (I, 8) of some of the ``points`` (..., N)."""
+    return lens[..., None, :].expand(*points.shape, lens.shape[-1])[index]
+
+
+def _upright(radii: Tensor, lens: Tensor) -> Tensor:
+    """Ideal radius, of ``radii`` (..., M), up to which tangential terms fold in no direction, (...).
+
+    Their Jacobian's norm is below 8 r |p|. Where that is less than both slopes of the radial profile, the determinant stays positive.
+    """
+    radial, slope = _radial(radii * radii, lens[..., None, :])
+    least = torch.minimum(radial, radial + 2 * radii * radii * slope)
+    holds = least > 8 * radii * torch.linalg.vector_norm(lens[..., 2:4], dim=-1, keepdim=True)
+    return radii.gather(-1, (holds.cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0))[..., 0]
+
+
+def _newton(point: _Point, aim: _Point, lens: Tensor) -> tuple[_Point, Tensor]:
     """The next point and how far it was, (..., N)."""
-    step = _solve(distort_jacobian(point, lens), target - distort(point, lens))
-    length = torch.linalg.vector_norm(step, dim=-1)
-    return point + step * (_STEP / length.clamp(min=_STEP))[..., None], length
+    x, y, along, across, down = _distorted(*point, lens)
+    dx, dy = _solved(along, across, down, aim[0] - x, aim[1] - y)
+    length = torch.hypot(dx, dy)
+    part = _STEP / length.clamp(min=_STEP)
+    return (point[0] + part * dx, point[1] + part * dy), length
 
 
-def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """2x2 systems; no step where the matrix has no inverse: a residual tells."""
-    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
-    determinant = a * d - b * c
+def _solved(a: Tensor, b: Tensor, d: Tensor, u: Tensor, v: Tensor) -> _Point:
+    """x, y of a x + b y = u, b x + d y = v; 0 where there is no inverse: a residual tells."""
+    determinant = a * d - b * b
     determinant = torch.where(determinant.abs() > 1e-6, determinant, torch.inf)
-    u, v = right.unbind(-1)
-    return torch.stack([(d * u - b * v) / determinant, (a * v - c * u) / determinant], -1)
+    return (d * u - b * v) / determinant, (a * v - b * u) / determinant
 
 
 def fisheye_radius(angle: Tensor, k: Tensor) -> Tensor:

@@ -32,6 +32,7 @@ def measured(seconds: float = 2.0, **psnr: float) -> dict[str, Any]:
     """As ``worker.work`` gives it."""
     return {
         "seconds": seconds,
+        "earlier_seconds": 0.0,
         "cpu_share": 0.9,
         "startup_seconds": 5.0,
         "load_seconds": 1.0,

@@ -116,7 +116,7 @@ def test_together_over_alone() -> None:
 def fits(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
     made: list[Job] = []
 
-    def fake(job: Job) -> dict[str, Any]:
+    def fake(job: Job, run: Path) -> dict[str, Any]:
         made.append(job)
         names = job.modalities or ("rgb", "ms")
         return measured(**{name: 20.0 + job.seed + job.recipe.loss.eikonal_weight for name in names})

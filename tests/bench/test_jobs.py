@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,8 @@ from rows import measured, scores
 
 from mmsynth.bench import jobs as jobs_module
 from mmsynth.bench.jobs import Job, code_hash, identity, mean_over_modalities, run_job, run_jobs, scene_hash
-from mmsynth.errors import InputError
+from mmsynth.errors import DivergedError, InputError
+from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
@@ -30,7 +33,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Names of the jobs that were run, none of which really was."""
     names: list[str] = []
 
-    def fake(job: Job) -> dict[str, Any]:
+    def fake(job: Job, run: Path) -> dict[str, Any]:
         names.append(job.name)
         return measured()
 
@@ -38,8 +41,8 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     yield names
 
 
-def test_one_real_fit_in_a_process_of_its_own() -> None:
-    row = run_job(JOB)
+def test_one_real_fit_in_a_process_of_its_own(tmp_path: Path) -> None:
+    row = run_job(JOB, tmp_path / "run")
     json.dumps(row, allow_nan=False)
     assert row["steps"] == 4 and row["seconds"] > 0 and row["peak_memory_bytes"] > 1e7 and 0 < row["cpu_share"] < 1.2
     assert row["rays_per_s"] > 0 and row["samples_per_s"] > 0 and row["render_rays_per_s"] > 0
@@ -47,36 +50,75 @@ def test_one_real_fit_in_a_process_of_its_own() -> None:
     assert row["scores"]["views"] == list(load_scene(EXAMPLE).split.test)
 
 
-def test_a_sensor_alone_is_scored_where_all_are() -> None:
+def test_a_sensor_alone_is_scored_where_all_are(tmp_path: Path) -> None:
     """Truth at the RGB pose needs the pose of the RGB frames and not the RGB sensor in the field."""
-    row = run_job(dataclasses.replace(JOB, modalities=("pol",), frames={}))
+    row = run_job(dataclasses.replace(JOB, modalities=("pol",), frames={}), tmp_path / "run")
     assert set(row["scores"]["modalities"]) == {"pol"}
     assert "psnr_aligned" in row["scores"]["modalities"]["pol"] and "depth_mae" in row["scores"]["geometry"]
 
 
-def test_what_the_child_refuses_is_one_sentence_here() -> None:
+def test_what_the_child_refuses_is_one_sentence_here(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected one of rgb.*[^.]\.$") as refused:
-        run_job(dataclasses.replace(JOB, modalities=("thermal",)))
+        run_job(dataclasses.replace(JOB, modalities=("thermal",)), tmp_path / "run")
     assert "\n" not in str(refused.value) and not str(refused.value).startswith("error")
 
 
-def test_a_child_that_dies_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_dies_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jobs_module.sys, "executable", "/bin/false")
     with pytest.raises(InputError, match="one: its process ended with status 1 instead of a score"):
-        run_job(JOB)
+        run_job(JOB, tmp_path / "run")
 
 
 def test_a_fit_ends_with_the_bench_that_started_it(tmp_path: Path) -> None:
-    task = json.dumps(dataclasses.replace(JOB, steps=None, budget=3600.0).task() | {"began": 0.0})
+    """While it reads its scene, here."""
+    task = json.dumps(dataclasses.replace(JOB, steps=None, budget=3600.0).task() | {"run": str(tmp_path / "run"), "began": 0.0})
     command = [sys.executable, "-m", "mmsynth.bench.worker", task, str(tmp_path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, cwd=ROOT, stderr=subprocess.DEVNULL) as child:
         assert child.stdin is not None
         child.stdin.close()
         try:
-            assert child.wait(timeout=120) == 1
+            assert child.wait(timeout=120) in (-signal.SIGTERM, 128 + signal.SIGTERM)
         finally:
             child.kill()
     assert not (tmp_path / "result.json").exists()
+
+
+def test_a_fit_in_the_middle_goes_on_and_its_time_counts(tmp_path: Path) -> None:
+    """Ended by Ctrl-C in the bench's own process, which is all that a terminal's group has: the fit's is in a session of its own."""
+    job = dataclasses.replace(JOB, modalities=("mono",), frames={}, steps=None, budget=6.0)
+    names = "from pathlib import Path; from mmsynth.bench.jobs import Job, run_jobs; from mmsynth.fitting.recipe import *"
+    code = f"{names}; list(run_jobs([{job!r}], Path({str(tmp_path)!r})))"
+    state = lambda: read_checkpoint(next((tmp_path / "fits").glob("one-*"), tmp_path))
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL) as bench:
+        try:
+            limit = time.monotonic() + 240.0
+            while state() is None and time.monotonic() < limit:  # one of no step is written before the first
+                time.sleep(0.1)
+            time.sleep(1.0)
+            bench.send_signal(signal.SIGINT)
+            assert bench.wait(timeout=120) != 0
+        finally:
+            bench.kill()
+    saved = state()
+    assert saved is not None and not list((tmp_path / "rows").glob("*"))
+    before = saved["state"]
+    assert 0 < before["step"] and 0.0 < before["elapsed"] < 6.0
+    (row,) = run_jobs([job], tmp_path)
+    assert row["earlier_seconds"] == before["elapsed"] and row["steps"] > before["step"]
+    assert 6.0 <= row["seconds"] and row["earlier_seconds"] < row["seconds"]
+    assert not list((tmp_path / "fits").glob("*"))
+
+
+def test_a_fit_that_diverged_starts_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def diverge(job: Job, run: Path) -> dict[str, Any]:
+        (run / "checkpoint").mkdir(parents=True)
+        raise DivergedError("fit: it diverged.")
+
+    monkeypatch.setattr(jobs_module, "run_job", diverge)
+    for _ in range(2):
+        with pytest.raises(DivergedError):
+            list(run_jobs([JOB], tmp_path))
+    assert not list((tmp_path / "fits").glob("*"))
 
 
 def test_a_result_that_is_there_is_not_made_again(fits: list[str], tmp_path: Path) -> None:

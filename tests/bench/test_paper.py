@@ -37,7 +37,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
     """The jobs that were run, none of which really was."""
     made: list[Job] = []
 
-    def fake(job: Job) -> dict[str, Any]:
+    def fake(job: Job, run: Path) -> dict[str, Any]:
         made.append(job)
         result = measured(3.0, **{name: invented(name, job.seed, job.name) for name in job.modalities or FIVE})
         for scores in result["scores"]["modalities"].values():
@@ -89,10 +89,10 @@ def test_a_fit_that_several_tables_ask_for_is_made_once(fits: list[Job], tmp_pat
 def test_it_goes_on_where_it_was(fits: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = jobs.run_job
 
-    def until_the_third(job: Job) -> dict[str, Any]:
+    def until_the_third(job: Job, run: Path) -> dict[str, Any]:
         if len(fits) == 3:
             raise KeyboardInterrupt
-        return made(job)
+        return made(job, run)
 
     monkeypatch.setattr(jobs, "run_job", until_the_third)
     run = lambda: bench_paper([EXAMPLE], tmp_path / "out", Recipe(), ["together"], steps=3)
@@ -112,10 +112,10 @@ def test_it_goes_on_where_it_was(fits: list[Job], tmp_path: Path, monkeypatch: p
 def test_a_fit_that_fails_stops_no_other_and_is_tried_again(fits: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = jobs.run_job
 
-    def broken(job: Job) -> dict[str, Any]:
+    def broken(job: Job, run: Path) -> dict[str, Any]:
         if job.modalities == ("mono",):
             raise DivergedError("fit: it diverged.")
-        return made(job)
+        return made(job, run)
 
     monkeypatch.setattr(jobs, "run_job", broken)
     report = bench_paper([EXAMPLE], tmp_path / "out", Recipe(), ["together"], steps=3)
@@ -195,7 +195,7 @@ def test_masks_are_learned_and_scored_with_and_part_of_a_result(
 
 
 def test_foreground_by_the_fields_own_opacity_is_no_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fake(job: Job) -> dict[str, Any]:
+    def fake(job: Job, run: Path) -> dict[str, Any]:
         result = measured(**dict.fromkeys(job.modalities or FIVE, 30.0))
         result["scores"]["modalities"]["rgb"]["foreground_from"] = "opacity"
         return result
@@ -254,7 +254,7 @@ def test_a_demosaicked_copy_is_fitted_and_the_raw_scene_scored(write_mmsdata: Ca
     root = write_mmsdata(range(4))
     before = sorted(root.rglob("*"))
     job = Job("one", str(root), Recipe(), None, {"nir": 2}, 0, 2, None, input="demosaicked", prepared=str(tmp_path / "prepared"))
-    row = jobs.run_job(job)
+    row = jobs.run_job(job, tmp_path / "run")
     assert set(row["scores"]["modalities"]) == {"rgb", "nir"} and row["scores"]["views"] == [3] and row["steps"] == 2
     assert sorted(root.rglob("*")) == before
     (copy,) = (tmp_path / "prepared").iterdir()

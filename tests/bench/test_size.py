@@ -24,7 +24,7 @@ SCALES = [Fraction(1, 4), Fraction(1, 2)]
 def fits(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
     made: list[Job] = []
 
-    def fake(job: Job) -> dict[str, Any]:
+    def fake(job: Job, run: Path) -> dict[str, Any]:
         made.append(job)
         assert job.budget is not None
         return measured(job.budget + 1, rgb=20 + job.budget)
