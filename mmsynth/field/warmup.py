@@ -60,6 +60,7 @@ def run_kernels() -> None:
     with torch.no_grad():
         kernels.classify(Occupancy(4).states, kernels.Cells(1.0, 1, 0, 0.1, 2.0), *surface.at(1))
         kernels.shade(weights, hits.features, directions, 0)
+        kernels.reflect(lamps.position, mirrors)
     _draw()
     parameter, gradient, first, second = torch.zeros(4, 1)
     kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))

@@ -123,6 +123,19 @@ def test_light_from_all_around_is_polarized_as_fresnel_says() -> None:
         torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
 
 
+def test_the_compiled_reflection_is_the_definition() -> None:
+    lamps, mirrors, _, _ = _case(500, 3)
+    with torch.no_grad():
+        found = kernels.reflect(lamps.position, mirrors)
+    expected = reflect(lamps.position.double(), Mirrors(*(x.double() for x in mirrors)))
+    assert (expected.amount > 0).any() and (expected.amount == 0).any()
+    for name, values, exact in zip(expected._fields, found, expected, strict=True):
+        torch.testing.assert_close(values.double(), exact, atol=2e-5, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+    position = lamps.position.clone().requires_grad_()
+    kernels.reflect(position, mirrors).amount.sum().backward()  # with a gradient it is the definition
+    assert position.grad is not None and position.grad.abs().sum() > 0
+
+
 def test_a_mirror_is_brightest_where_the_angles_are_equal() -> None:
     """At the top of a lobe L = s V F / F(1) n·l / 4 (...): the closed form, and less beside it."""
     raw = (-2.0, 1.0, 3.0)

@@ -20,7 +20,7 @@ from torch import Tensor
 from mmsynth.field.kernels import cpu, learning, reference
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.learning import no_light
-from mmsynth.field.kernels.mirroring import Reflection, Surroundings, reflect, surround
+from mmsynth.field.kernels.mirroring import Reflection, Surroundings, surround
 from mmsynth.field.kernels.parameters import (
     AdamPart,
     AdamStep,
@@ -184,6 +184,11 @@ def compare(
 def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -> Tensor:
     """Mirrored light in each measured number."""
     return _backend(mirrors.share).mirror(lamps, mirrors, behind, measured)
+
+
+def reflect(position: Tensor, mirrors: Mirrors) -> Reflection:
+    """What surfaces mirror of each lamp."""
+    return _backend(mirrors.share).reflect(position, mirrors)
 
 
 def learn(

@@ -31,6 +31,7 @@ from mmsynth.field.kernels.constants import (
 from mmsynth.field.kernels.drawing import draw as draw  # this, ``mirroring`` and ``shading`` are of the reference, too
 from mmsynth.field.kernels.drawing import odds as odds
 from mmsynth.field.kernels.mirroring import mirror as mirror
+from mmsynth.field.kernels.mirroring import reflect as reflect
 from mmsynth.field.kernels.parameters import (
     AdamStep,
     Cells,

@@ -13,7 +13,7 @@ from mmsynth.field.kernels.cpu.caching import remove_old_versions
 KERNELS = (
     surface.surface_forward, surface.surface_backward, surface.surface_scatter, surface.classify,
     marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
-    shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward,
+    shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward, mirroring.reflect,
     learning.learn_rays, learning.finish, drawing.draw_rays, drawing.fill_odds, optimiser.adam_tensor,
 )  # fmt: skip
 _OF_MANY = learning.learn_rays_together, learning.finish_together  # more than two threads

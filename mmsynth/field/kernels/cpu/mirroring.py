@@ -116,6 +116,31 @@ def _around(row, mirrors, out):  # type: ignore[no-untyped-def]
     out[6] = less * less / (_ONE + (product + along) * (product + along))
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reflect_rows(begin, end, lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
+    """``reflect`` of some surfaces."""
+    count, width = lamps.position.shape[0], mirrors.material.shape[1]
+    soft, gate = np.empty((end - begin, width), np.float32), np.empty((end - begin, width), np.float32)
+    softplus(mirrors.material[begin:end].reshape(-1), (end - begin) * width, soft.reshape(-1), gate.reshape(-1))
+    terms = np.empty(21, np.float32)
+    for i in range(end - begin):
+        alpha, row = _LEAST + (_ONE - _LEAST) * gate[i, 0], begin + i
+        for k in range(count):
+            _terms(row, k, lamps, mirrors, True, terms)
+            amount[row, k] = _amount(alpha, soft[i, 1], gate[i, 5 + k], terms)
+            axis[row, k, 0], axis[row, k, 1], axis[row, k, 2] = terms[17], terms[18], terms[19]
+            degree[row, k] = terms[20] * gate[i, 4]
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def reflect(lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
+    """See ``mirroring.reflect``."""
+    surfaces = mirrors.points.shape[0]
+    for task in prange((surfaces + CHUNK - 1) // CHUNK):
+        begin = np.int64(task) * CHUNK
+        _reflect_rows(begin, min(begin + CHUNK, surfaces), lamps, mirrors, amount, axis, degree)
+
+
 @njit(cache=True, inline="always", error_model="numpy")
 def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
     """Share of the light behind an analyser."""

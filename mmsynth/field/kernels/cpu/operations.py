@@ -39,6 +39,7 @@ from mmsynth.field.kernels.cpu.stores import (
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.cpu.tasks import take_beside
 from mmsynth.field.kernels.learning import gradient_of, no_light
+from mmsynth.field.kernels.mirroring import Reflection
 from mmsynth.field.kernels.parameters import (
     AdamPart,
     Cells,
@@ -279,6 +280,16 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     layers, heads, biases = _shader_layers(_arrays(weights))
     shading.shade(_array(features), _array(directions), degrees, layers, padded(heads.T), biases, outputs.numpy())
     return outputs
+
+
+def reflect(position: Tensor, mirrors: Mirrors) -> Reflection:
+    """See ``mirroring.reflect``; fused without a gradient."""
+    if _kept(position, *mirrors):
+        return reference.reflect(position, mirrors)
+    surfaces, count = len(mirrors.points), len(position)
+    found = Reflection(torch.empty(surfaces, count), torch.empty(surfaces, count, 3), torch.empty(surfaces, count))
+    mirroring.reflect(_arrays(Lamps(position, torch.empty(count, 0))), _arrays(mirrors), *(x.numpy() for x in found))
+    return found
 
 
 def mirror(lamps: Lamps, mirrors: Mirrors, behind: Tensor, measured: Measured) -> Tensor:

@@ -17,9 +17,9 @@ from mmsynth.field.kernels.cuda.shading import compare
 from mmsynth.field.kernels.cuda.shared import available
 from mmsynth.field.kernels.cuda.surface import surface_gradient, surface_value
 from mmsynth.field.kernels.cuda.tracing import trace
-from mmsynth.field.kernels.reference import march, odds, section_weights, shade
+from mmsynth.field.kernels.reference import march, odds, reflect, section_weights, shade
 
 __all__ = [
-    "adam", "available", "compare", "draw", "hash_encode", "learn", "march", "mirror", "odds", "section_weights", "shade",
-    "surface_gradient", "surface_value", "trace",
+    "adam", "available", "compare", "draw", "hash_encode", "learn", "march", "mirror", "odds", "reflect", "section_weights",
+    "shade", "surface_gradient", "surface_value", "trace",
 ]  # fmt: skip
