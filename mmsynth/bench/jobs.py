@@ -2,8 +2,8 @@
 
 A result lies in ``OUT/rows/<name>-<digest>.json``, and the digest is that of everything the result depends on (``identity``): pixels,
 poses, truth, recipe, length, seed, the package's own code, its libraries, the machine. So a result on disk is never out of date, and a
-benchmark that was interrupted continues where it was, in the middle of a fit, too: until there is a result, ``OUT/fits/<name>-<digest>`` is
-the run folder.
+benchmark that was interrupted continues where it was, in the middle of a fit, too: until there is a result, the folder
+``OUT/rows/<name>-<digest>`` is that of the run.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def scene_hashes(jobs: Sequence[Job]) -> dict[str, str]:
 def result_of(job: Job, scene: str, out: Path) -> dict[str, Any]:
     """The row of one job, see ``run_jobs``; ``scene``: its ``scene_hash``."""
     path, wanted = _file_of(job, scene, out)
-    run = out / "fits" / path.stem
+    run = path.with_suffix("")
     if not path.is_file():
         machine = identify()
         about = {"name": job.name, "seed": job.seed, "device": job.device, "cores": machine["cores"], "threads": machine["threads"]}
@@ -179,8 +179,9 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
             environment.setdefault("NUMBA_NUM_THREADS", environment["OMP_NUM_THREADS"])
         # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result. Ctrl-C is for
         # this process alone (a session of its own): a second signal would not let the child write its checkpoint
-        how: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said, "start_new_session": True}
-        with subprocess.Popen(command, env=environment, **how) as process:
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=environment, start_new_session=True
+        ) as process:
             assert process.stdin is not None
             try:
                 status = process.wait()

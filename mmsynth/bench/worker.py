@@ -65,8 +65,7 @@ def work(task: Mapping[str, Any]) -> dict[str, Any]:
     scene = scene_of(task)
     length = {"steps": task["steps"], "budget": task["budget"], "seed": task["seed"]}
     run, recipe = Path(task["run"]), Recipe(**task["recipe"])
-    saved = read_checkpoint(run)
-    earlier = 0.0 if saved is None else saved["state"]["elapsed"]
+    earlier = _trained(run)
     field = fit(scene, run, recipe=recipe, **length, device=device, resume=True, prior=prior, on_start=loaded, on_step=stepped)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     started.setdefault("startup_seconds", time.time() - task["began"])  # no step was left
@@ -86,6 +85,12 @@ def work(task: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _trained(run: Path) -> float:
+    """Seconds of training that are in a run's checkpoint."""
+    saved = read_checkpoint(run)
+    return 0.0 if saved is None else float(saved["state"]["elapsed"])
+
+
 def serve(work: Callable[[Mapping[str, Any]], dict[str, Any]]) -> None:
     """Read the arguments, work on the task, write the result; an error becomes one sentence and its exit code."""
 
@@ -94,6 +99,7 @@ def serve(work: Callable[[Mapping[str, Any]], dict[str, Any]]) -> None:
             pass
         os.kill(os.getpid(), signal.SIGTERM)
 
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what started the bench may ignore it
     threading.Thread(target=end_with_the_parent, daemon=True).start()
     task, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
     try:

@@ -14,6 +14,7 @@ from mmsynth.errors import InputError
 if TYPE_CHECKING:
     from mmsynth.scene.scene import MaskMeaning
 
+ResultsOption = Annotated[Path, typer.Option(help="what is there already is not made again, and a fit that was interrupted goes on")]
 RunOption = Annotated[Path | None, typer.Option("--run", help="run folder; default: the last fit made in this folder")]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu or cuda")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print one JSON object on stdout and nothing else there")]

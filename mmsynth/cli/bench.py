@@ -15,6 +15,7 @@ from mmsynth.cli.arguments import (
     MasksOption,
     ModalitiesOption,
     RecipeOption,
+    ResultsOption,
     RunOption,
     SceneArgument,
     fit_length,
@@ -43,7 +44,7 @@ def bench_fit(
     frames: FramesOption = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     device: DeviceOption = "cpu",
-    out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/fit"),
+    out: ResultsOption = Path("bench/fit"),
     as_json: JsonOption = False,
 ) -> None:
     """Error over time: a fit from scratch per time budget, each in a process of its own."""
@@ -77,9 +78,7 @@ def bench_size(
     recipe: RecipeOption = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     device: DeviceOption = "cpu",
-    out: Annotated[
-        Path, typer.Option(help="what is there already is neither rendered nor fitted again, and a fit that was interrupted goes on")
-    ] = Path("bench/size"),
+    out: ResultsOption = Path("bench/size"),
     as_json: JsonOption = False,
 ) -> None:
     """The scene of a run as its field shows it to full-size sensors: error over time, start-up and memory by the size of frames."""
@@ -135,7 +134,7 @@ def bench_ablation(
     seeds: Annotated[str, typer.Option(help="every variant is fitted with each, e.g. 0,1,2")] = "0",
     only: Annotated[str | None, typer.Option(help="names of variants; the baseline is added")] = None,
     device: DeviceOption = "cpu",
-    out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/ablation"),
+    out: ResultsOption = Path("bench/ablation"),
     as_json: JsonOption = False,
 ) -> None:
     """What each choice is worth: variants of a fit against a baseline, in seconds and dB."""
@@ -160,7 +159,7 @@ def bench_paper(
     recipe: RecipeOption = None,
     masks: MasksOption = None,
     device: DeviceOption = "cpu",
-    out: Annotated[Path, typer.Option(help="what is there already is not fitted again")] = Path("bench/paper"),
+    out: ResultsOption = Path("bench/paper"),
     as_json: JsonOption = False,
 ) -> None:
     """The tables of MultimodalStudio and SPOiLeR, on any scenes. Under torchrun every process takes its share of the fits."""

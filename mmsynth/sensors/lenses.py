@@ -38,7 +38,7 @@ _ITERATIONS, _ALL = 30, 4  # of Newton's method; how many all points take: from 
 _AT_REST = 1e-13  # the step of a point that has arrived
 _TOLERANCE = 1e-10  # of the residual, at unit focal length
 _STEP = 0.25  # the most that Newton's method moves at once: it stays on its branch
-_ALONG = 16  # places on a ray's way from the axis where folds are looked for, if there may be any
+_ALONG = 64  # places on a ray's way from the axis where folds are looked for, if there may be any
 
 
 def _radial(r2: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,6 +89,21 @@ def fold_radius(k: Tensor) -> Tensor:
     return torch.where((k != 0).any(-1), torch.tan(_first_fall(slope, STEEPEST, k)), torch.inf)
 
 
+def _upright_radius(k: Tensor) -> Tensor:
+    """Ideal radius up to which tangential terms fold in no direction, (..., 8) → (...).
+
+    Their Jacobian's norm is below 8 r |p|. Where that is less than both slopes of the radial profile, the determinant stays positive.
+    """
+    p = torch.linalg.vector_norm(k[..., 2:4], dim=-1, keepdim=True)
+
+    def room(angle: Tensor) -> Tensor:
+        r = torch.tan(angle)
+        radial, d = _radial(r * r, k[..., None, :])
+        return torch.minimum(radial, radial + 2 * r * r * d) - 8 * r * p
+
+    return torch.tan(_first_fall(room, STEEPEST, k))
+
+
 def undistort(xy: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
     """Distorted → ideal, the inverse of ``distort`` on the branch that starts at the axis.
 
@@ -137,7 +152,7 @@ def _undistorted(target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     there, reached = _distorted(*point, lens), torch.hypot(*point)
     valid = (torch.hypot(aim[0] - there[0], aim[1] - there[1]) < _TOLERANCE) & (reached <= limit[..., None])
     if bool(lens[..., 2:4].any()):  # tangential terms may fold, too: the orientation holds all the way from the axis
-        index = torch.nonzero(valid & (reached > _upright(radii, lens)[..., None]), as_tuple=True)
+        index = torch.nonzero(valid & (reached > _upright_radius(lens)[..., None]), as_tuple=True)
         if len(index[0]):
             x, y, lenses = point[0][index][:, None], point[1][index][:, None], _at(index, lens, distance)
             for share in torch.linspace(0.0, 1.0, _ALONG + 1)[1:].tolist():
@@ -149,17 +164,6 @@ def _undistorted(target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
 def _at(index: tuple[Tensor, ...], lens: Tensor, points: Tensor) -> Tensor:
     """The lenses (I, 8) of some of the ``points`` (..., N)."""
     return lens[..., None, :].expand(*points.shape, lens.shape[-1])[index]
-
-
-def _upright(radii: Tensor, lens: Tensor) -> Tensor:
-    """Ideal radius, of ``radii`` (..., M), up to which tangential terms fold in no direction, (...).
-
-    Their Jacobian's norm is below 8 r |p|. Where that is less than both slopes of the radial profile, the determinant stays positive.
-    """
-    radial, slope = _radial(radii * radii, lens[..., None, :])
-    least = torch.minimum(radial, radial + 2 * radii * radii * slope)
-    holds = least > 8 * radii * torch.linalg.vector_norm(lens[..., 2:4], dim=-1, keepdim=True)
-    return radii.gather(-1, (holds.cumprod(-1).sum(-1, keepdim=True) - 1).clamp(min=0))[..., 0]
 
 
 def _newton(point: _Point, aim: _Point, lens: Tensor) -> tuple[_Point, Tensor]:

@@ -88,7 +88,7 @@ def test_a_fit_in_the_middle_goes_on_and_its_time_counts(tmp_path: Path) -> None
     job = dataclasses.replace(JOB, modalities=("mono",), frames={}, steps=None, budget=6.0)
     names = "from pathlib import Path; from mmsynth.bench.jobs import Job, run_jobs; from mmsynth.fitting.recipe import *"
     code = f"{names}; list(run_jobs([{job!r}], Path({str(tmp_path)!r})))"
-    state = lambda: read_checkpoint(next((tmp_path / "fits").glob("one-*"), tmp_path))
+    state = lambda: read_checkpoint(next((tmp_path / "rows").glob("one-*"), tmp_path))
     with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL) as bench:
         try:
             limit = time.monotonic() + 240.0
@@ -100,13 +100,13 @@ def test_a_fit_in_the_middle_goes_on_and_its_time_counts(tmp_path: Path) -> None
         finally:
             bench.kill()
     saved = state()
-    assert saved is not None and not list((tmp_path / "rows").glob("*"))
+    assert saved is not None and not list((tmp_path / "rows").glob("*.json"))
     before = saved["state"]
     assert 0 < before["step"] and 0.0 < before["elapsed"] < 6.0
     (row,) = run_jobs([job], tmp_path)
     assert row["earlier_seconds"] == before["elapsed"] and row["steps"] > before["step"]
     assert 6.0 <= row["seconds"] and row["earlier_seconds"] < row["seconds"]
-    assert not list((tmp_path / "fits").glob("*"))
+    assert [path.suffix for path in (tmp_path / "rows").iterdir()] == [".json"]
 
 
 def test_a_fit_that_diverged_starts_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,7 @@ def test_a_fit_that_diverged_starts_anew(tmp_path: Path, monkeypatch: pytest.Mon
     for _ in range(2):
         with pytest.raises(DivergedError):
             list(run_jobs([JOB], tmp_path))
-    assert not list((tmp_path / "fits").glob("*"))
+    assert not list((tmp_path / "rows").glob("*"))
 
 
 def test_a_result_that_is_there_is_not_made_again(fits: list[str], tmp_path: Path) -> None:

@@ -97,6 +97,30 @@ def test_points_behind_the_fold_are_not_seen(row: Row) -> None:
     row("a point at 60° before a lens that folds at 42°", f"projected into the picture, at column {theirs[0]:.0f}", "not seen")
 
 
+@pytest.mark.parametrize("distortion", [(-0.33, 0.2, -0.15, -0.06), (-0.08, -0.11, 0.08, -0.12, 0.05)])
+def test_the_picture_turns_over_on_the_way_to_a_pixel(row: Row, distortion: tuple[float, ...]) -> None:
+    """Beyond a fold by tangential terms a lens may be upright again: there a ray comes back to its pixel, and is another one's."""
+    camera = Camera(161, 161, 40.0, 40.0, 80.0, 80.0, distortion)
+
+    def turned(ideal: np.ndarray, looks: int) -> np.ndarray:
+        along = torch.linspace(0.0, 1.0, looks + 1, dtype=torch.float64)[1:, None, None] * torch.from_numpy(ideal)
+        return (torch.linalg.det(lenses.distort_jacobian(along, torch.from_numpy(camera.coefficients))) < -1e-2).any(0).numpy()
+
+    theirs = _newton(camera)
+    comes_back = _error(theirs, camera) < 1e-3
+    wrong = turned(theirs[comes_back], 1000)
+    looked_at = wrong[~turned(theirs[comes_back], 4)].sum()
+    directions, valid = ray_map(camera)
+    ours = directions[valid]
+    assert wrong.sum() > 500 and looked_at > 100
+    assert valid.mean() > 0.5 and not turned(ours[:, :2] / ours[:, 2:], 1000).any()
+    row(
+        f"tangential terms {distortion[2]}, {distortion[3]}",
+        f"the residual is 0 at {wrong.sum()} pixels beyond a fold, four looks along the way leave {looked_at}",
+        "all masked",
+    )
+
+
 def test_tangential_terms_keep_their_place(row: Row) -> None:
     """File order is k1 k2 p1 p2 k3 k4; read as k1 k2 k3 k4 p1 p2, tangential distortion becomes radial."""
     right = Camera(2592, 1944, 2300.0, 2300.0, 1295.5, 971.5, (-0.1, 0.08, 1e-3, -8e-4, 0.0, 0.0))
