@@ -29,8 +29,8 @@ from mmsynth.scene.scene import Frame, Region, Sensor
 from mmsynth.sensors.camera import Camera, rays_by_parts
 from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 
-TILE = 8192  # rays at a time: what they need stays in the caches
-_TILES = 32  # whose rays are made together
+TILE, _ON_GPU = 8192, 1 << 17  # rays at a time: what they need stays in the caches; of a GPU fewer leave most idle
+_AT_ONCE = 1 << 18  # rays that are made together
 MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
@@ -295,6 +295,11 @@ class Field(nn.Module):
         return out
 
     @property
+    def tile(self) -> int:
+        """How many rays to cast at a time."""
+        return TILE if self.device.type == "cpu" else _ON_GPU
+
+    @property
     def shines(self) -> bool:
         """Whether there are lamps whose light surfaces mirror."""
         return self.light is not None and self.light.count > 0
@@ -362,11 +367,11 @@ class Field(nn.Module):
         images: dict[str, np.ndarray] = {}
         forward = np.zeros(pixels, np.float32)
         # rays by parts: those of a whole picture of a full-size sensor would take more memory than what they show
-        for index, in_camera in rays_by_parts(camera, _TILES * TILE):
+        for index, in_camera in rays_by_parts(camera, _AT_ONCE):
             valid[index], forward[index] = True, in_camera[:, 2]
-            for start in range(0, len(index), TILE):
-                rows = index[start : start + TILE]
-                for key, value in self.cast(in_camera[start : start + TILE], pose, names, geometry).items():
+            for start in range(0, len(index), self.tile):
+                rows = index[start : start + self.tile]
+                for key, value in self.cast(in_camera[start : start + self.tile], pose, names, geometry).items():
                     if key not in images:
                         images[key] = np.full((pixels, *value.shape[1:]), 0.0 if key == "opacity" else np.nan, np.float32)
                     images[key][rows] = value

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mmsynth.errors import InputError
-from mmsynth.field.field import TILE, Field
+from mmsynth.field.field import Field
 from mmsynth.sensors.camera import Camera, ray_map
 
 
@@ -42,7 +42,7 @@ def render_light(field: Field, camera: Camera, camera_to_world: np.ndarray, moda
     in_camera, valid = ray_map(camera)
     rows = np.flatnonzero(valid)
     directions = in_camera.reshape(-1, 3)[rows]
-    tiles = [directions[start : start + TILE] for start in range(0, len(directions), TILE)]
+    tiles = [directions[start : start + field.tile] for start in range(0, len(directions), field.tile)]
     parts = [field.cast(tile, camera_to_world, names, geometry=False, light=True) for tile in tiles]
 
     def image(key: str, channels: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import fields
 import numpy as np
 import torch
 
-from mmsynth.field.field import TILE, Field
+from mmsynth.field.field import Field
 from mmsynth.field.light import mean_spectrum
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import SceneSamples, Shapes, shapes_of
@@ -36,8 +36,8 @@ def sample_field(field: Field, frames: Sequence[Frame], name: str, exposure: Exp
         in_camera, valid = ray_map(frame.camera)
         inside = np.flatnonzero(valid)
         rows = random.choice(inside, min(each, len(inside)), replace=False)
-        for start in range(0, len(rows), TILE):
-            origins, directions, camera_x = field.rays_of(in_camera.reshape(-1, 3)[rows[start : start + TILE]], field.pose_of(frame))
+        for start in range(0, len(rows), field.tile):
+            origins, directions, camera_x = field.rays_of(in_camera.reshape(-1, 3)[rows[start : start + field.tile]], field.pose_of(frame))
             seen = field.render_rays(origins, directions, camera_x, field.measured, geometry=True, light=True)
             x, y = reference_axes(directions, camera_x)
             for key, value in {**seen, "directions": directions, "x": x, "y": y}.items():
@@ -86,8 +86,8 @@ def learn_from_frames(field: Field, prediction: Prediction, sensor: Sensor, fram
         photosites = np.argwhere(usable)
         photosites = photosites[np.sort(random.choice(len(photosites), min(each, len(photosites)), replace=False))]
         pixel, k = photosites.T
-        for start in range(0, len(pixel), TILE):
-            rows = slice(start, start + TILE)
+        for start in range(0, len(pixel), field.tile):
+            rows = slice(start, start + field.tile)
             origins, directions, camera_x = field.rays_of(in_camera.reshape(-1, 3)[pixel[rows]], field.pose_of(frame))
             out = field.render_rays(origins, directions, camera_x, list(prediction.facts.known), geometry=True, light=True)
             seen = field.seen(out, origins, directions, camera_x, True)

@@ -32,7 +32,7 @@ def read_checkpoint(run: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        return torch.load(path, weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)  # the device that it was made on may not be here
     except Exception as error:  # torch raises many kinds for a broken archive
         if is_out_of_memory(error):
             raise

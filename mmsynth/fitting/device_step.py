@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,13 +27,12 @@ from mmsynth.fitting import importance
 from mmsynth.fitting.graphs import Repeated
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.measurements import Measurements
-from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.needs import SAMPLES_ON_GPU, Needs
 from mmsynth.fitting.optimiser import BETAS, EPSILON, Adam
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import blocked_weight, shallow_factor
 from mmsynth.fitting.terms import eikonal_points
 
-SAMPLES = 1 << 18  # of a step, at the least: with fewer a GPU idles between kernels
 MOST_RAYS = 1 << 18
 _NEWS_EVERY = 16  # steps
 _AHEAD = 2  # times that, by which the host is ahead of the device at the most: a fit of so many seconds does not end later
@@ -97,7 +96,8 @@ class DeviceStep:
         capture: whether stages become graphs.
     """
 
-    samples, most_rays, first_rays = SAMPLES, MOST_RAYS, SAMPLES // 64  # a ray of the first step takes that many samples or more
+    samples, most_rays = SAMPLES_ON_GPU, MOST_RAYS
+    first_rays = SAMPLES_ON_GPU // 64  # a ray of the first step takes that many samples or more
 
     def __init__(
         self,
@@ -128,8 +128,8 @@ class DeviceStep:
         self.flat, self.begins = self._flatten()
         self.rates = {n: torch.full((1,), adam.rates[n], device=device) for n in _TABLES}
         self.works: dict[Stage, Repeated] = {}
-        self.pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
         self.tables: list[int] = []
+        self.pool: Any = None
         self.lamps: tuple[int, ...] = ()
         self.renew()
 
@@ -181,9 +181,10 @@ class DeviceStep:
         self.selection.weight.copy_(self.where.selection.weight)
         light = self.field.light
         self.lamps = () if light is None else tuple(torch.nonzero(light.used)[:, 0].tolist())
-        tables = [self.adam.parameters[n].data_ptr() for n in _TABLES]
+        tables = [x.data_ptr() for n in _TABLES for x in (self.adam.parameters[n], *self.adam.moments[n])]
         if tables != self.tables:
             self.works.clear()  # their arrays are gone
+            self.pool = torch.cuda.graph_pool_handle() if self.field.device.type == "cuda" else None  # memory of graphs goes with them
         self.tables = tables
 
     def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, surface_factor: float) -> None:

@@ -26,6 +26,8 @@ _LOOKED_AT = 4096  # pixels of a modality, to see what is outside
 _PAST = 0.005  # share of the pixels that see past the region, below which nothing is there
 _RAYS_PER_SECOND = 70_000  # of a fit, about: a constant, so that the design does not depend on the clock
 _SAMPLES_PER_RAY = 10  # of a fit, about
+SAMPLES_ON_GPU = 1 << 18  # of a step, at the least: with fewer a GPU idles between kernels
+_SAMPLES_PER_SECOND_ON_GPU = 100_000_000  # what is asked of one, and a seventh of what it could do on paper: none was measured
 _BY_RECIPE = "asked for by the recipe"
 _NOTHING = "the input says that it is black, transparent or outside the object's masks"
 
@@ -93,9 +95,12 @@ class _Facts:
         return [n for n, m in self.measurements.items() if asked and not m.masked]
 
 
-def expected_rays(recipe: Recipe, steps: int | None, budget: float | None) -> float:
-    """Rays that a fit of so many steps or seconds will see, about."""
-    return steps * recipe.sampling.samples_per_step / _SAMPLES_PER_RAY if steps is not None else (budget or 0.0) * _RAYS_PER_SECOND
+def expected_rays(recipe: Recipe, steps: int | None, budget: float | None, on_gpu: bool = False) -> float:
+    """Rays that a fit of so many steps or seconds will see, about. ``on_gpu``: its steps are those of ``device_step``."""
+    if steps is None:
+        return (budget or 0.0) * (_SAMPLES_PER_SECOND_ON_GPU / _SAMPLES_PER_RAY if on_gpu else _RAYS_PER_SECOND)
+    samples = recipe.sampling.samples_per_step
+    return steps * (max(samples, SAMPLES_ON_GPU) if on_gpu else samples) / _SAMPLES_PER_RAY
 
 
 def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, rays_to_come: float) -> Needs:

@@ -50,7 +50,9 @@ class Adam:
         self.count += 1
 
     def resize(self, name: str, kept: int) -> None:
-        """Follow a parameter that has new rows behind its first ``kept``."""
+        """Follow a parameter that has new rows behind its first ``kept``; of one that has none the moments stay where they are."""
+        if kept == len(self.parameters[name]) == len(self.moments[name][0]):
+            return
         self.moments[name] = [torch.cat([m[:kept], torch.zeros_like(self.parameters[name][kept:])]) for m in self.moments[name]]
 
     def forget(self, name: str) -> None:

@@ -66,7 +66,8 @@ class Trainer:
         self.recipe, self.steps, self.budget, self.seed = recipe, steps, budget, seed
         self.device = torch.device(device)
         torch.manual_seed(seed)
-        rays_to_come = expected_rays(recipe, steps, budget)
+        fused = self.device.type == "cuda" and kernels.fused_on_gpu()
+        rays_to_come = expected_rays(recipe, steps, budget, fused)
         self.measurements: Measurements = load_measurements(scene, rays_to_come=rays_to_come, device=self.device, on_load=on_load)
         self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come)
         sensors = {n: m.sensor for n, m in self.measurements.items()}
@@ -91,7 +92,7 @@ class Trainer:
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
         self.has_empty = self.measurements.empty is not None
         self.on_device: DeviceStep | None = None
-        if self.device.type == "cuda" and kernels.fused_on_gpu():
+        if fused:
             from mmsynth.fitting.device_step import DeviceStep
 
             given = self.field, self.measurements, self.importance, self.optimiser, self.log_gain, self.needs, recipe, seed
@@ -115,6 +116,11 @@ class Trainer:
         if self.steps is not None:
             return min(1.0, self.state.step / self.steps)
         return min(1.0, self.state.elapsed / self.budget)  # type: ignore[operator]
+
+    @property
+    def kernels_made(self) -> int:
+        """Kernels that were compiled, or loaded, as steps came to need them: on a GPU alone, see ``field.warmup`` for a CPU."""
+        return kernels.made_on_gpu() if self.device.type == "cuda" else 0
 
     @property
     def choices(self) -> dict[str, Choice[Any]]:
@@ -220,10 +226,12 @@ class Trainer:
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
             self._resize_tables(state.tables, generator)
+        dark = False  # that there are no lamps is asked after a look alone: a GPU would be waited for
         if state.light is None and state.light_looks < light_looks(self.progress, self.recipe):
             look_for_lamps(field, self.measurements, sampling, self.seed)
             state.light_looks += 1
-        if state.light is None and (self.progress >= schedule.light_until or (state.light_looks and not field.shines)):
+            dark = not field.shines
+        if state.light is None and (dark or self.progress >= schedule.light_until):
             state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed)
             self._mirror(state.light)
             look_for_lamps(field, self.measurements, sampling, self.seed)

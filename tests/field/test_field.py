@@ -101,7 +101,7 @@ def test_a_rendering_does_not_depend_on_how_many_rays_are_made_together(monkeypa
     pose[2, 3] = -1.5
     whole = field.render(camera, pose)
     monkeypatch.setattr(fields, "TILE", 16)
-    monkeypatch.setattr(fields, "_TILES", 4)
+    monkeypatch.setattr(fields, "_AT_ONCE", 64)
     done: list[int] = []
     seen = field.render(camera, pose, progress=done.append)
     assert sum(done) == whole.valid.sum() < whole.valid.size and max(done) == 16

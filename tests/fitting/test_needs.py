@@ -9,7 +9,7 @@ import pytest
 
 from mmsynth.field.storage import load_field, save_field
 from mmsynth.fitting.measurements import load_measurements
-from mmsynth.fitting.needs import Needs, assess
+from mmsynth.fitting.needs import SAMPLES_ON_GPU, Needs, assess, expected_rays
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
@@ -74,6 +74,15 @@ def _fitted(scene: Scene, steps: int = 260, **recipe: object) -> Trainer:
     while trainer.progress < 1:
         trainer.run_step()
     return trainer
+
+
+def test_a_gpu_is_expected_to_see_as_many_rays_as_its_steps_have() -> None:
+    """By a processor's number a full-size scene would be learned as coarsely there."""
+    recipe = Recipe().with_changes({"sampling.samples_per_step": 1 << 14})
+    assert expected_rays(recipe, 100, None, on_gpu=True) / expected_rays(recipe, 100, None) == SAMPLES_ON_GPU / (1 << 14)
+    large = recipe.with_changes({"sampling.samples_per_step": 1 << 20})
+    assert expected_rays(large, 100, None, on_gpu=True) == expected_rays(large, 100, None)
+    assert expected_rays(recipe, None, 60.0, on_gpu=True) > 100 * expected_rays(recipe, None, 60.0)
 
 
 def test_a_diffuse_ball_in_the_dark_gets_nothing_superfluous(tmp_path: Path) -> None:

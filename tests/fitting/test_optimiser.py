@@ -76,6 +76,14 @@ def test_an_optimiser_and_a_mean_follow_a_table_of_another_size(size: int) -> No
     assert table.shape == average.means["a.table"].shape == (size, 4)
 
 
+def test_moments_of_a_table_that_keeps_its_size_stay_where_they_are() -> None:
+    """A GPU's graphs go on with them."""
+    optimiser = Adam(parameters := _parameters(), dict.fromkeys(parameters, 0.1))
+    before = list(optimiser.moments["a.table"])
+    optimiser.resize("a.table", len(parameters["a.table"]))
+    assert all(new is old for new, old in zip(optimiser.moments["a.table"], before, strict=True))
+
+
 def test_cleared_gradients_change_nothing() -> None:
     parameters = _parameters()
     optimiser = Adam(parameters, dict.fromkeys(parameters, 0.1))

@@ -255,6 +255,22 @@ def test_an_interrupted_fit_says_how_to_go_on(scene: Scene, tmp_path: Path, monk
     assert saved is not None and saved["state"]["step"] == 0  # none of the steps since was saved, none of them half done
 
 
+def test_what_a_gpu_compiles_in_a_step_is_not_time_of_training(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four steps of ten seconds the first and the third make kernels."""
+    step, made, now = Trainer.run_step, [0, 1, 1, 2, 2], [0.0]
+
+    def ten_seconds(self: Trainer) -> None:
+        step(self)
+        now[0] += 10.0
+
+    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(Trainer, "run_step", ten_seconds)
+    monkeypatch.setattr(Trainer, "kernels_made", property(lambda self: made[self.state.step]))
+    fit(scene, tmp_path, recipe=SMALL, steps=4)
+    saved = read_checkpoint(tmp_path)
+    assert saved is not None and saved["state"]["elapsed"] == 20.0
+
+
 def test_the_seed_decides_the_field(scene: Scene, tmp_path: Path) -> None:
     a, b, c = (_tensors(fit(scene, tmp_path / str(i), recipe=SMALL, steps=6, seed=s)) for i, s in enumerate((0, 0, 1)))
     assert all(torch.equal(a[name], b[name]) for name in a)

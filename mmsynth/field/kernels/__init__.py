@@ -96,6 +96,7 @@ __all__ = [
     "hash_encode",
     "intensity",
     "learn",
+    "made_on_gpu",
     "march",
     "mirror",
     "no_light",
@@ -128,6 +129,12 @@ def _on_gpu() -> ModuleType:
 def fused_on_gpu() -> bool:
     """Whether Triton serves this machine's GPU."""
     return _on_gpu() is not reference
+
+
+def made_on_gpu() -> int:
+    """How many kernels Triton compiled, or loaded, until now: what asked for them waited."""
+    backend = _on_gpu()
+    return 0 if backend is reference else int(backend.made())
 
 
 def _backend(tensor: Tensor) -> ModuleType:

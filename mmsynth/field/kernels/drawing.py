@@ -153,9 +153,11 @@ def _read(frames: Frames, frame: Tensor, pixel: Tensor, values: int) -> tuple[Te
     has_alpha = stride > values
     at = torch.cat([first[:, None] + torch.arange(values, device=pixel.device), (first + torch.where(has_alpha, values, 0))[:, None]], 1)
     found = torch.empty(at.shape, dtype=frames.origin.dtype, device=pixel.device)
-    for k, (stored, scale) in enumerate(((frames.codes8, 255.0), (frames.codes16, 65535.0), (frames.floats, 1.0))):
+    signed = frames.codes16.view(torch.int16)  # torch indexes no uint16 on a GPU
+    for k, (stored, scale) in enumerate(((frames.codes8, 255.0), (signed, 65535.0), (frames.floats, 1.0))):
         of_kind = kind == k
-        found[of_kind] = stored[at[of_kind]].to(found.dtype) / scale
+        codes = stored[at[of_kind]]
+        found[of_kind] = (codes.int() & 0xFFFF if stored is signed else codes).to(found.dtype) / scale
     target, alpha = found[:, :values], torch.where(has_alpha, found[:, values], torch.nan)
     return torch.where(has_alpha[:, None], target * alpha[:, None], target), alpha
 

@@ -36,7 +36,6 @@ _OF_POLARIZATION = ("s0", "dolp", "aolp")
 _OF_SURFACE = ("depth", "normals", "opacity", "coverage")
 _OF_LIGHT = ("diffuse", "specular")
 _DEVIATION = 5.0  # times as bright
-_TILE = 8192  # rays
 
 Seen = Mapping[str, np.ndarray]
 """What a camera sees, (H, W, ...) by the keys of ``Field.render_rays``, float32: depth and normals are NaN where nothing is met, and all
@@ -200,7 +199,7 @@ def look(field: Field, view: PosedCamera, displays: Iterable[Display], go_on: Ca
     """What a camera sees of all that displays need.
 
     Args:
-        go_on: asked after every 8,192 rays.
+        go_on: asked after every tile of rays, see ``Field.tile``.
     Returns:
         None where ``go_on`` said no.
     """
@@ -211,9 +210,9 @@ def look(field: Field, view: PosedCamera, displays: Iterable[Display], go_on: Ca
     rows = np.flatnonzero(valid)
     directions = in_camera.reshape(-1, 3)[rows]
     found: dict[str, np.ndarray] = {}
-    for start in range(0, len(rows), _TILE):
-        part = rows[start : start + _TILE]
-        for key, value in field.cast(directions[start : start + _TILE], view.camera_to_world, names, normals, light).items():
+    for start in range(0, len(rows), field.tile):
+        part = rows[start : start + field.tile]
+        for key, value in field.cast(directions[start : start + field.tile], view.camera_to_world, names, normals, light).items():
             if key not in found:
                 found[key] = np.full((valid.size, *value.shape[1:]), np.nan, np.float32)
             found[key][part] = value

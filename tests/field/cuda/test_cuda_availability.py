@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -57,6 +57,24 @@ def test_a_broken_toolchain_is_a_reason_not_an_error(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(torch, "zeros", fail)
     assert shared._probe.__wrapped__() == (False, "no triton kernel can be run: Failed to find C compiler.")
+
+
+def test_a_triton_or_a_gpu_that_is_too_old_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(shared, "triton", SimpleNamespace(__version__="3.4.0"))
+    assert cuda.available() == (False, "triton 3.4.0 is older than 3.5")
+    monkeypatch.setattr(shared, "triton", SimpleNamespace(__version__="3.6.0"))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (7, 5))
+    assert cuda.available() == (False, "a GPU of compute capability 7.5, not 8.0 or later")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+def test_triton_says_what_it_compiles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(shared, "_made", [])
+    hook = shared.triton.knobs.runtime.jit_cache_hook
+    assert cuda.made() == 0
+    assert [hook(key="", repr=name, fn=None, compile=None) for name in ("march", "look")] == [False, False]  # it goes on
+    assert cuda.made() == 2 and capsys.readouterr().err.count("preparing GPU kernels") == 1
 
 
 class _OnGpu:

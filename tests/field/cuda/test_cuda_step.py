@@ -6,13 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 
-sys.path.append(str(Path(__file__).parents[2] / "fitting"))
+sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("fitting", "hard_cases")]
 import test_device_step
+from pretended_gpu import few_looks, pretended_gpu
+from small_scenes import QUICK, around, write_scene
 
 from mmsynth.field import kernels
 from mmsynth.field.kernels import reference
 from mmsynth.fitting.device_step import DeviceStep
 from mmsynth.fitting.schedule import sampling_at
+from mmsynth.fitting.trainer import Trainer
+from mmsynth.scene.load import load_scene
 
 
 def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,3 +56,62 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
     assert torch.equal(field.surface.grid.table, table) and not step.flat.gradient.any()
     step.sync()
     assert trainer.optimiser.count == 2
+
+
+def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
+    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``mmsynth fit --device cuda`` does it, on a GPU that is not there: what is to be a graph waits for nothing."""
+    if device != "cpu":
+        pytest.skip("a fit on a GPU does it")
+    few_looks(monkeypatch, rays=8)
+    monkeypatch.setattr(DeviceStep, "samples", 256)
+    monkeypatch.setattr(DeviceStep, "first_rays", 8)
+    scene = load_scene(write_scene(tmp_path, {"rgb": around(4), "nir": around(4)}))
+    recipe = QUICK.with_changes({"radiance.exposure": "on", "radiance.light": "on", "poses.views": "on", "sampling.initial_rays": 8})
+    begin = lambda: Trainer(scene, recipe, steps=6, budget=None, seed=0, device="cuda")
+    with pretended_gpu() as gpu:
+        whole = begin()
+        while whole.progress < 1.0:
+            whole.run_step()
+            if whole.state.step == 4:
+                torch.save(whole.checkpoint(), tmp_path / "saved.pt")
+        assert whole.on_device is not None and gpu.captures > 0
+        later = begin()
+        later.restore(torch.load(tmp_path / "saved.pt"))
+        while later.progress < 1.0:
+            later.run_step()
+        first, second = whole.checkpoint(), later.checkpoint()
+    state = whole.state
+    assert state.decided is not None and state.light is not None and state.tables is not None and whole.refinement.steps > 1
+    assert state.step == 6 and state.bad_steps == 0 and 0.0 < state.mean_loss < 10.0 and state.samples_total > state.rays_total
+    assert first["state"] == second["state"]
+    for name, value in first["field"].items():
+        assert torch.equal(value, second["field"][name]), name
+
+
+def test_arrays_that_graphs_hold_stay_or_the_graphs_go(device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the tables are as large as they should be nothing is replaced; larger ones and their moments are new, and so are the graphs."""
+    if device != "cpu":
+        pytest.skip("a fit on a GPU does it")
+    few_looks(monkeypatch, rays=8)
+    monkeypatch.setattr(DeviceStep, "samples", 256)
+    monkeypatch.setattr(DeviceStep, "first_rays", 8)
+    scene = load_scene(write_scene(tmp_path, {"rgb": around(4)}))
+    recipe = QUICK.with_changes({"schedule.tables_at": 0.011, "sampling.initial_rays": 8})
+    with pretended_gpu() as gpu:
+        trainer = Trainer(scene, recipe, steps=200, budget=None, seed=0, device="cuda")
+        step, table = trainer.on_device, trainer.field.surface.grid.table
+        assert step is not None
+        place = table.data_ptr(), trainer.optimiser.moments["surface.grid.table"][0].data_ptr()
+        for _ in range(5):
+            trainer.run_step()
+        assert trainer.state.tables is not None and gpu.captures >= 3 and len(step.works) == 1
+        assert place == (table.data_ptr(), trainer.optimiser.moments["surface.grid.table"][0].data_ptr())
+        trainer.optimiser.moments["appearance.table"] = [m.clone() for m in trainer.optimiser.moments["appearance.table"]]
+        (work,) = step.works.values()
+        with pytest.raises(AssertionError, match="others have taken the place of"):
+            trainer.run_step()
+        step.renew()
+        assert not step.works and work.calls > 3
+        trainer.run_step()

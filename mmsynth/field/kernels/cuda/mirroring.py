@@ -24,7 +24,7 @@ TINY = constant(1e-12)
 
 @jit
 def _rows(share, behind, rays, RAYS: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Of each lane its ray and its row, whether that is the nearest, exists, and is met; its share."""
+    """Of each lane its ray and its row, whether there is such a ray, whether the row is its nearest, and whether it exists; its share."""
     lane = tl.arange(0, 2 * RAYS)
     r = tl.program_id(0) * RAYS + lane // 2
     live, nearest = r < rays, lane % 2 == 0
@@ -32,7 +32,7 @@ def _rows(share, behind, rays, RAYS: tl.constexpr):  # type: ignore[no-untyped-d
     exists = live & (nearest | (second >= 0))
     row = tl.where(nearest, r, tl.where(exists, second, rays + r))
     shares = tl.load(share + row, mask=exists, other=0.0)
-    return r, row, live, nearest, exists & (shares > 0.0), shares
+    return r, row, live, nearest, exists, shares
 
 
 @jit
@@ -98,7 +98,8 @@ def mirror_kernel(  # type: ignore[no-untyped-def]
     RAYS: tl.constexpr,
 ):  # fmt: skip
     """used: (lamps,), which of the rows of ``positions`` and ``spectrum`` there are. LOG: the spectrum's logarithm is given."""
-    r, row, live, nearest, met, shares = _rows(share, behind, rays, RAYS)
+    r, row, live, nearest, exists, shares = _rows(share, behind, rays, RAYS)
+    met = exists & (shares > 0.0)
     px, py, pz = position(points, row, met)
     dx, dy, dz = position(directions, row if PER_ROW else r, met)
     nx, ny, nz = position(normals, row, met)
@@ -154,7 +155,8 @@ def mirror_backward_kernel(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """WIDTH, HEADS, PLACES: sizes of the tiles that COLUMNS, OUTPUTS and LAMPS are filled up to. TRAINS: ``trains`` says of which rays
     surfaces are taught. ADD: g_share is added to. partial: of the lamps' positions, then of their (LOG) spectra."""
-    r, row, live, _, met, shares = _rows(share, behind, rays, RAYS)
+    r, row, live, _, exists, shares = _rows(share, behind, rays, RAYS)
+    met = exists & (shares > 0.0)
     px, py, pz = position(points, row, met)
     dx, dy, dz = position(directions, row if PER_ROW else r, met)
     nx, ny, nz = position(normals, row, met)
@@ -275,7 +277,7 @@ def mirror_backward_kernel(  # type: ignore[no-untyped-def]
     taught = met
     if TRAINS:
         taught = met & (tl.load(trains + r, mask=live, other=0) != 0)
-    written = live & (row < rows)
+    written = exists | (live & (rows == 2 * rays))  # zeros, too, for what is not there but has a row of its own
     tl.store(g_material + row[:, None] * COLUMNS + w, tl.where(taught[:, None], of_raw, 0.0), mask=written[:, None] & (w < COLUMNS))
     tl.store(g_normals + 3 * row, tl.where(taught, gx, 0.0), mask=written)
     tl.store(g_normals + 3 * row + 1, tl.where(taught, gy, 0.0), mask=written)

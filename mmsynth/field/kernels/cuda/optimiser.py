@@ -33,6 +33,7 @@ def adam_kernel(  # type: ignore[no-untyped-def]
 ):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     _move(parameter, gradient, first, second, i, i < count, rate, root, beta1, beta2, epsilon, SPARSE)
+    tl.debug_barrier()  # another thread may clear what this one has loaded
     tl.store(gradient + i, 0.0, mask=i < count)
 
 
@@ -52,6 +53,7 @@ def guarded_adam_kernel(  # type: ignore[no-untyped-def]
         rate = tl.load(rates) * tl.load(factors + KIND)
     one, two = 1.0 - tl.exp(number * log_beta1), 1.0 - tl.exp(number * log_beta2)
     _move(parameter, gradient, first, second, i, live & good, rate / one, 1.0 / tl.sqrt(two), beta1, beta2, epsilon, SPARSE)
+    tl.debug_barrier()
     tl.store(gradient + i, 0.0, mask=live)
 
 

@@ -217,7 +217,7 @@ def compare_kernel(  # type: ignore[no-untyped-def]
             of_share = tl.where(met, of_share - sum_of_pair(of_passed, RAYS), 0.0)
         if OPACITY:
             of_share += tl.where(met, 2.0 * known * off + linear + blocked / passed_by, 0.0)
-        written = live & (row < rows)  # zeros, too, for what is not met but has a row
+        written = met | (live & (rows == 2 * rays))  # zeros, too, for what is not met but has a row of its own
         tl.store(g_features + row[:, None] * FEATURES + f[None, :], gx, mask=written[:, None] & (f < FEATURES)[None, :])
         tl.store(g_share + row, of_share, mask=written)
     tl.store(loss + program, tl.sum(total, 0))

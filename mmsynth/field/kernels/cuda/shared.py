@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 from typing import Any
 
 import torch
@@ -16,17 +17,21 @@ try:
 except ImportError:
     triton = tl = None
 
+_OLDEST = (3, 5)  # before it each thread got a result of its own of an atomic addition whose lanes several threads share
+_LEAST = (8, 0)  # compute capability: the products are those of its tensor cores
 _PROGRAMS_PER_CORE = 4  # of a persistent kernel, for each multiprocessor
 # numbers that a kernel must not be compiled anew for where they happen to be 1 or multiples of 16
 _PLAIN = [
     "count", "rays", "rows", "levels", "active", "grid", "width", "stride", "size", "bright", "bisections", "lamps", "asked", "drawn",
-    "modalities", "first", "second", "third", "fourth", "tile_bisections", "frame_bisections",
+    "modalities", "key_0", "key_1", "key_2", "key_3", "tile_bisections", "frame_bisections",
 ]  # fmt: skip
+# parts of arrays: where they begin in memory is as odd as the number of rays
+_ANYWHERE = ["origins", "directions", "jitter", "loss", "total"]
 
 
 def jit(function: Any) -> Any:
-    """``triton.jit`` that compiles once, not anew for sizes that happen to be 1 or multiples of 16; a no-op without triton."""
-    return function if triton is None else triton.jit(do_not_specialize=_PLAIN)(function)
+    """``triton.jit`` that compiles once, not anew for sizes and places that happen to be 1 or multiples of 16; a no-op without triton."""
+    return function if triton is None else triton.jit(do_not_specialize=_PLAIN, do_not_specialize_on_alignment=_ANYWHERE)(function)
 
 
 def constant(value: float) -> Any:
@@ -141,4 +146,28 @@ def available() -> tuple[bool, str]:
         return False, "triton is not installed"
     if not torch.cuda.is_available():
         return False, "torch sees no CUDA device"
+    if tuple(int(number) for number in triton.__version__.split(".")[:2]) < _OLDEST:
+        return False, f"triton {triton.__version__} is older than {_OLDEST[0]}.{_OLDEST[1]}"
+    if (capability := torch.cuda.get_device_capability()) < _LEAST:
+        return False, f"a GPU of compute capability {capability[0]}.{capability[1]}, not {_LEAST[0]}.{_LEAST[1]} or later"
     return _probe()
+
+
+_made: list[str] = []
+
+
+def _note(*_: Any, repr: str = "", **__: Any) -> bool:
+    """What Triton calls before it compiles a kernel, or loads one that it compiled before."""
+    if not _made:
+        print("preparing GPU kernels, the first time for a minute or more ...", file=sys.stderr, flush=True)
+    _made.append(repr)
+    return False  # go on
+
+
+def made() -> int:
+    """How many kernels were compiled or loaded until now, for each of which the host waited."""
+    return len(_made)
+
+
+if triton is not None and hasattr(triton, "knobs"):
+    triton.knobs.runtime.jit_cache_hook = _note

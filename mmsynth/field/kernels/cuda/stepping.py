@@ -30,15 +30,15 @@ class Numbers(NamedTuple):
 
 
 @jit
-def numbers_kernel(sharpness, step, factors, key, a, b, c, d, first, second, third, fourth):  # type: ignore[no-untyped-def]
+def numbers_kernel(sharpness, step, factors, key, a, b, c, d, key_0, key_1, key_2, key_3):  # type: ignore[no-untyped-def]
     tl.store(sharpness, a)
     tl.store(step, b)
     tl.store(factors, c)
     tl.store(factors + 1, d)
-    tl.store(key, first)
-    tl.store(key + 1, second)
-    tl.store(key + 2, third)
-    tl.store(key + 3, fourth)
+    tl.store(key, key_0)
+    tl.store(key + 1, key_1)
+    tl.store(key + 2, key_2)
+    tl.store(key + 3, key_3)
 
 
 def new_numbers(device: torch.device) -> Numbers:
