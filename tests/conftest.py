@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,6 +21,9 @@ from mmsynth.sensors.camera import Camera
 
 WIDTH, HEIGHT = 24, 18
 sys.path.append(str(Path(__file__).parent / "field"))  # cases of the CPU's kernels are those of Triton's
+
+# a script's background job begins with SIGINT ignored, and so would what tests interrupt
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # two threads a process on two cores wait for each other at every barrier; a test may still ask for more
