@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -36,12 +37,14 @@ class PretendedGpu(TorchFunctionMode):
 
     Attributes:
         captured: whether what is done now is to be a graph: then the host may wait for nothing. captures: how often it was.
+        waits: what the host waited for, outside of graphs.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.places: dict[int, tuple[StorageWeakRef, torch.device]] = {}  # a reference keeps the storage's address from being used again
         self.captured, self.captures = False, 0
+        self.waits: Counter[str] = Counter()
 
     def place(self, tensor: Tensor) -> torch.device | None:
         """Where it is, None: nobody said."""
@@ -70,6 +73,8 @@ class PretendedGpu(TorchFunctionMode):
         there = [t for t in tensors if self.place(t) == GPU]
         if self.captured:
             self._check_capture(name, tensors, there, kwargs)
+        elif there and (name in _WAITS or (name == "__getitem__" and any(t.dtype == torch.bool for t in _tensors(args[1:])))):
+            self.waits[name] += 1
         if func == _GRAD:
             return func(*args) if (found := func(*args)) is None or not there else self.put(found, GPU)
         if func == torch.Tensor.backward:

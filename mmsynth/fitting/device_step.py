@@ -1,8 +1,9 @@
 """A step of a fit on a GPU, without the host: rays are drawn there, learned from and judged there, and the optimiser steps there.
 
 The host says what changes from step to step by the arguments of one small kernel and starts a graph, one for each ``Stage`` of the fit. It
-reads what the device tells of its steps from time to time, when that has arrived: the number of rays follows the samples that late. A step
-whose loss or gradients are not finite is not taken, which the device decides, too.
+reads what the device tells of its steps from time to time, when the next that it tells is on its way: the number of rays follows the
+samples that late, and no result depends on how quick either is. A step whose loss or gradients are not finite is not taken, which the
+device decides, too.
 
 All parameters but the tables lie in one array, with their gradients and moments in others: one kernel steps them all.
 """
@@ -34,8 +35,7 @@ from mmsynth.fitting.schedule import blocked_weight, shallow_factor
 from mmsynth.fitting.terms import eikonal_points
 
 MOST_RAYS = 1 << 18
-_NEWS_EVERY = 16  # steps
-_AHEAD = 2  # times that, by which the host is ahead of the device at the most: a fit of so many seconds does not end later
+_NEWS_EVERY = 16  # steps, and by as many the host is ahead of the device at the most: a fit of so many seconds ends when it should
 _PER_OCTAVE = 4  # numbers of rays for which there are graphs: within 10 % of what is asked for
 _TABLES = {"surface.grid.table": 1, "appearance.table": 0}  # and which of ``Numbers.factors`` is theirs
 
@@ -61,14 +61,23 @@ class Stage:
 
 
 class News(NamedTuple):
-    """Of some steps together: how many, how many of them were bad, samples; of a good one the mean loss and squared error per modality, NaN
-    where none was good."""
+    """Of some steps together: how many, how many of them were bad, rays, samples; of a good one the mean loss and squared error per
+    modality, NaN where none was good."""
 
     steps: int
     bad: int
+    rays: int
     samples: int
     loss: float
     errors: dict[str, float]
+
+
+class _Told(NamedTuple):
+    """What the device told of all its steps until then, when it has arrived (None: at once), and the rays of these steps."""
+
+    numbers: Tensor
+    arrival: torch.cuda.Event | None
+    rays: int
 
 
 class _Flat(NamedTuple):
@@ -123,8 +132,8 @@ class DeviceStep:
         self.numbers = stepping.new_numbers(device)
         self.steps = torch.tensor([0, adam.count], dtype=torch.int32, device=device)
         self.told = torch.zeros(4 + len(self.order), dtype=torch.float64, device=device)
-        self.read = np.zeros(len(self.told))
-        self.copies: list[tuple[Tensor, torch.cuda.Event | None]] = []
+        self.rays, self.read, self.read_rays = 0, np.zeros(len(self.told)), 0
+        self.copies: list[_Told] = []
         self.flat, self.begins = self._flatten()
         self.rates = {n: torch.full((1,), adam.rates[n], device=device) for n in _TABLES}
         self.works: dict[Stage, Repeated] = {}
@@ -175,10 +184,13 @@ class DeviceStep:
             self.lamps if light is not None else (), decided and self.field.far_light is not None, gains, early, counts, empty,
         )  # fmt: skip
 
-    def renew(self) -> None:
-        """Take up what was changed between steps: where rays go, lamps, tables of other sizes."""
+    def select(self) -> None:
+        """Take up where rays go from now on."""
         self.selection.ends.copy_(self.where.selection.ends)
         self.selection.weight.copy_(self.where.selection.weight)
+
+    def renew(self) -> None:
+        """Take up what was changed between steps: lamps, tables of other sizes."""
         light = self.field.light
         self.lamps = () if light is None else tuple(torch.nonzero(light.used)[:, 0].tolist())
         tables = [x.data_ptr() for n in _TABLES for x in (self.adam.parameters[n], *self.adam.moments[n])]
@@ -198,6 +210,7 @@ class DeviceStep:
         key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
         stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, surface_factor, key)
         self.works[stage]()
+        self.rays += sum(stage.rays)
         if (number + 1) % _NEWS_EVERY == 0:
             self._tell()
 
@@ -272,33 +285,34 @@ class DeviceStep:
         return work
 
     def _tell(self) -> None:
-        """Send what the device tells on its way; the host is never more than ``_AHEAD`` times that far ahead of it."""
-        if len(self.copies) > _AHEAD and (oldest := self.copies[0][1]) is not None:
-            oldest.synchronize()
+        """Send what the device tells on its way, when what it told before has arrived."""
+        if self.copies and (before := self.copies[-1].arrival) is not None:
+            before.synchronize()
         if self.told.device.type == "cpu":
-            self.copies.append((self.told.clone(), None))
+            self.copies.append(_Told(self.told.clone(), None, self.rays))
             return
         copy = torch.empty(self.told.shape, dtype=self.told.dtype, pin_memory=True)
         copy.copy_(self.told, non_blocking=True)
         event = torch.cuda.Event()
         event.record(torch.cuda.current_stream(self.told.device))
-        self.copies.append((copy, event))
+        self.copies.append(_Told(copy, event, self.rays))
 
     def news(self, wait: bool = False) -> News | None:
-        """What has arrived since the last time, None: nothing. ``wait``: for all that was done until now."""
+        """What was told before the last time, None: nothing. ``wait``: for all that was done until now."""
         if wait:
             self._tell()
-            if self.copies[-1][1] is not None:
-                self.copies[-1][1].synchronize()
+            if (last := self.copies[-1].arrival) is not None:
+                last.synchronize()
         latest = None
-        while self.copies and (self.copies[0][1] is None or self.copies[0][1].query()):
-            latest = self.copies.pop(0)[0].numpy()
-        if latest is None or not (more := latest - self.read)[0]:
+        while len(self.copies) > (0 if wait else 1):
+            latest = self.copies.pop(0)
+        if latest is None or not (more := latest.numbers.numpy() - self.read)[0]:
             return None
-        self.read = latest.copy()
+        rays, self.read, self.read_rays = latest.rays - self.read_rays, latest.numbers.numpy().copy(), latest.rays
         good = more[0] - more[1]
         mean = lambda total: float(total / good) if good else float("nan")
-        return News(int(more[0]), int(more[1]), int(more[2]), mean(more[3]), dict(zip(self.order, map(mean, more[4:]), strict=True)))
+        errors = dict(zip(self.order, map(mean, more[4:]), strict=True))
+        return News(int(more[0]), int(more[1]), rays, int(more[2]), mean(more[3]), errors)
 
     def sync(self) -> None:
         """Wait for the device, and let the optimiser know how often it stepped."""

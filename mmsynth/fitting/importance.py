@@ -30,7 +30,7 @@ class Importance:
     """
 
     def __init__(self, even: kernels.Selection, first_tile: Tensor, evenly: float) -> None:
-        self.selection, self.first_tile, self.evenly = even, first_tile, evenly
+        self.selection, self.first_tile, self.evenly = even, first_tile.cpu(), evenly  # numbers that the host asks for
         self.residuals = even.weight.new_ones(len(even.weight))
 
     def renew(self) -> None:

@@ -173,7 +173,7 @@ class Trainer:
         state.rays_after = self._adapted(rays, samples_of_step(self.progress, self.recipe), samples, _MOST_RAYS)
         state.step += 1
 
-    def _adapted(self, rays: int, wanted: float, samples: float, most: int) -> int:
+    def _adapted(self, rays: float, wanted: float, samples: float, most: int) -> int:
         """The number of rays for a step of so many samples: half of the way there, of a factor of two at the most either way.
 
         Args:
@@ -185,10 +185,12 @@ class Trainer:
     def _step_on(self, step: DeviceStep, sampling: kernels.Sampling) -> None:
         """A step that the device takes while the host goes on; what earlier ones told is taken in."""
         state, done = self.state, self.progress
-        prepared = state.step // _RENEW_EVERY, state.light_looks, *(x is None for x in (state.tables, state.light, state.decided))
+        prepared = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided))
         if prepared != self.prepared:
             step.renew()
-            self.prepared = prepared
+        if prepared != self.prepared or state.step % _RENEW_EVERY == 0:
+            step.select()
+        self.prepared = prepared
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
         step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
@@ -212,7 +214,7 @@ class Trainer:
             for name, error in news.errors.items():
                 state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         wanted = max(samples_of_step(self.progress, self.recipe), step.samples)
-        state.rays = self._adapted(state.rays, wanted, news.samples / news.steps, step.most_rays)
+        state.rays = self._adapted(news.rays / news.steps, wanted, news.samples / news.steps, step.most_rays)
 
     def _prepare(self, sampling: kernels.Sampling, generator: torch.Generator) -> None:
         """What is due before a step: the occupancy grid, where rays go, the rows of the tables, what residuals decide, the poses."""

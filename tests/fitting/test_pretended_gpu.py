@@ -19,6 +19,8 @@ from test_device_step import SMALL
 from mmsynth.field import kernels
 from mmsynth.field.kernels import reference
 from mmsynth.field.storage import load_field
+from mmsynth.fitting import device_step
+from mmsynth.fitting import trainer as trainer_module
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.graphs import Repeated
 from mmsynth.fitting.run import fit
@@ -135,6 +137,39 @@ def test_a_fit_without_triton_is_that_of_the_cpu(tmp_path: Path, monkeypatch: py
     assert on_gpu["state"]["step"] == 3 and on_gpu["state"]["decided"] is not None and on_gpu["state"]["light"] is not None
     assert on_gpu["refinement"]["steps"] > 0
     _same(on_gpu, on_cpu)
+
+
+def test_between_decisions_the_host_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not in 40 steps of a fit on a GPU between two looks for lamps, in which it selects rays anew and hears of its steps; kernels are left
+    out."""
+
+    def work(step: device_step.DeviceStep, *_: object) -> Callable[[], object]:
+        one = torch.tensor([1.0, 0.0, *[1.0] * (len(step.told) - 2)], dtype=step.told.dtype, device=step.told.device)  # none is bad
+        return lambda: step.told.add_(one)
+
+    monkeypatch.setattr(kernels, "_on_gpu", lambda: reference)
+    monkeypatch.setattr(kernels, "fused_on_gpu", lambda: True)
+    monkeypatch.setattr(device_step.DeviceStep, "_work", work)
+    monkeypatch.setattr(device_step.stepping, "set_numbers", lambda *_: None)
+    looks = lambda field, *_: field.light.add(torch.ones(1, 3, device=field.device))
+    monkeypatch.setattr(trainer_module, "look_for_lamps", looks)
+    few_looks(monkeypatch)
+    recipe = SMALL.with_changes({
+        "sampling.occupancy_every": 1000, "schedule.light_at": 0.3, "schedule.light_until": 0.45, "schedule.decide_at": 0.6,
+        "poses.start_at": 0.9,
+    })  # fmt: skip
+    with pretended_gpu() as gpu:
+        trainer = trainer_module.Trainer(load_scene(data_folder("example_scene")), recipe, steps=1000, budget=None, seed=0, device="cuda")
+        trainer.state.step = 305
+        trainer.run_step()
+        assert gpu.waits and trainer.state.light_looks == 1 and trainer.state.light is None and trainer.on_device is not None
+        gpu.waits.clear()
+        rays = trainer.state.rays
+        for _ in range(40):
+            trainer.run_step()
+        assert not gpu.waits and trainer.state.light_looks == 1
+        assert trainer.state.mean_loss == 1.0 and trainer.state.rays > 1.4 * rays  # it heard of steps, and that they have too few samples
+        assert trainer.on_device.lamps == (0,)
 
 
 def _numbers(found: Any) -> Iterator[np.ndarray]:
