@@ -139,7 +139,7 @@ def launch_table(trainer: Trainer) -> Table:
         Column("Waits of the host", "waits", "d"),
     )  # fmt: skip
     note = (
-        "Of one step, all of which but one kernel is a CUDA graph. Every 16 steps the host waits until what it was told 16 steps before has "
-        "arrived, which it has, and the odds of tiles are renewed, without waiting; the occupancy is renewed every 32, and that waits."
+        "Of one step, all of which but one kernel is a CUDA graph. Every 16 steps the host waits for what it was told 16 steps before, "
+        "which has arrived, and the odds of tiles are renewed, without waiting; the occupancy is renewed every 32, and that waits."
     )
     return Table("Launches of a step", columns, rows, note)
