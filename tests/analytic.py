@@ -68,7 +68,7 @@ class AnalyticField:
         self.rig = {s.name: np.eye(4) for s in sensors}
         for i, s in enumerate(sensors):
             self.rig[s.name][0, 3] = 0.05 * i
-        self.points = 0  # that were asked for
+        self.points, self.tile = 0, 8192  # that were asked for; rays at a time
         self.renders = 0
 
     def state_dict(self) -> dict[str, torch.Tensor]:

@@ -68,15 +68,15 @@ def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
     monkeypatch.setattr(DeviceStep, "samples", 256)
     monkeypatch.setattr(DeviceStep, "first_rays", 8)
     scene = load_scene(write_scene(tmp_path, {"rgb": around(4), "nir": around(4)}))
-    recipe = QUICK.with_changes({"radiance.exposure": "on", "radiance.light": "on", "poses.views": "on", "sampling.initial_rays": 8})
-    begin = lambda: Trainer(scene, recipe, steps=6, budget=None, seed=0, device="cuda")
-    with pretended_gpu() as gpu:
+    recipe = QUICK.with_changes({"radiance.exposure": "on", "radiance.light": "off", "poses.views": "on", "sampling.initial_rays": 8})
+    begin = lambda: Trainer(scene, recipe, steps=4, budget=None, seed=0, device="cuda")
+    with pretended_gpu():
         whole = begin()
         while whole.progress < 1.0:
             whole.run_step()
-            if whole.state.step == 4:
+            if whole.state.step == 3:
                 torch.save(whole.checkpoint(), tmp_path / "saved.pt")
-        assert whole.on_device is not None and gpu.captures > 0
+        assert whole.on_device is not None
         later = begin()
         later.restore(torch.load(tmp_path / "saved.pt"))
         while later.progress < 1.0:
@@ -84,7 +84,7 @@ def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
         first, second = whole.checkpoint(), later.checkpoint()
     state = whole.state
     assert state.decided is not None and state.light is not None and state.tables is not None and whole.refinement.steps > 1
-    assert state.step == 6 and state.bad_steps == 0 and 0.0 < state.mean_loss < 10.0 and state.samples_total > state.rays_total
+    assert state.step == 4 and state.bad_steps == 0 and 0.0 < state.mean_loss < 10.0 and state.samples_total > state.rays_total
     assert first["state"] == second["state"]
     for name, value in first["field"].items():
         assert torch.equal(value, second["field"][name]), name
