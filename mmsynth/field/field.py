@@ -1,4 +1,7 @@
-"""The field of a scene: learned by a fit, rendered by every operation."""
+"""The field of a scene: learned by a fit, rendered by every operation.
+
+Its parts, and what rays see of them together, stand in one file: what one of them is decides what the others show.
+"""
 
 from __future__ import annotations
 
