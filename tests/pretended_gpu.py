@@ -20,16 +20,17 @@ from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.overrides import TorchFunctionMode
 
+from mmsynth.bench.launches import READS
 from mmsynth.fitting import candidates, decisions, lighting, measurements, needs, refinement, table_sizes
 from mmsynth.fitting.graphs import Repeated
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
 _DEVICE, _IS_CUDA, _GRAD = torch.Tensor.device.__get__, torch.Tensor.is_cuda.__get__, torch.Tensor.grad.__get__  # type: ignore[attr-defined]
-_DATA_IS, _GRAD_IS = torch.Tensor.data.__set__, torch.Tensor.grad.__set__  # type: ignore[attr-defined]
+_DATA_IS = torch.Tensor.data.__set__  # type: ignore[attr-defined]
 # what takes tensors of two devices: copies, and places in a tensor, which may be the CPU's
 _ANY = {"copy_", "__getitem__", "__setitem__", "load_state_dict", "_has_compatible_shallow_copy_type"}
 _FROM_HOST = {"tensor", "new_tensor", "as_tensor", "asarray"}
-_WAITS = {"item", "tolist", "numpy", "cpu", "nonzero", "equal", "__bool__", "__int__", "__float__", "__index__", "__array__", "unique"}
+_WAITS = READS | {"nonzero", "equal", "unique"}
 
 
 class PretendedGpu(TorchFunctionMode):

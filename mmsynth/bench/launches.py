@@ -21,7 +21,7 @@ from mmsynth.fitting.trainer import Trainer
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 
-_READS = {"item", "tolist", "numpy", "cpu", "__bool__", "__int__", "__float__", "__index__", "__array__"}
+READS = {"item", "tolist", "numpy", "cpu", "__bool__", "__int__", "__float__", "__index__", "__array__"}
 _WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "unique_dim", "_unique2", "repeat_interleave"}
 # what makes no kernel: memory, and other views of it
 _NOTHING = {
@@ -73,7 +73,7 @@ class _Reads(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = getattr(func, "__name__", "")
-        if name in _READS:
+        if name in READS:
             self.counted.waits[name] += 1
         return func(*args, **(kwargs or {}))
 

@@ -69,9 +69,9 @@ def work(task: Mapping[str, Any]) -> dict[str, Any]:
     field = fit(scene, run, recipe=recipe, **length, device=device, resume=True, prior=prior, on_start=loaded, on_step=stepped)
     seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     started.setdefault("startup_seconds", time.time() - task["began"])  # no step was left
-    peak = peak_memory()
-    # reserved, not allocated: what graphs hold counts
-    of_gpu = {} if device == "cpu" else {"peak_gpu_bytes": torch.cuda.max_memory_reserved(device)}
+    peak = {"peak_memory_bytes": peak_memory()}
+    if device != "cpu":
+        peak["peak_gpu_bytes"] = torch.cuda.max_memory_reserved(device)  # not allocated: what graphs hold counts
     # the whole scene, so that sensors that were not fitted still lend their poses to be scored at, and as it was recorded
     scores = evaluate(field, whole_scene_of(task), views=scene.split.test)
     return {
@@ -79,8 +79,7 @@ def work(task: Mapping[str, Any]) -> dict[str, Any]:
         "earlier_seconds": earlier,
         "cpu_share": cpu / (seconds * torch.get_num_threads()),
         **started,
-        "peak_memory_bytes": peak,
-        **of_gpu,
+        **peak,
         **{key: field.manifest[key] for key in ("steps", "rays_per_s", "samples_per_s")},
         "render_rays_per_s": scores["rays_per_s"],
         "scores": scores,

@@ -128,11 +128,12 @@ class DeviceStep:
         self.modalities = measurements.modalities._replace(output=torch.tensor(columns, dtype=torch.int32, device=device))
         self.values = [measurements[n].values for n in self.order]
         self.polarized = [measurements[n].sensor.is_polarization for n in self.order]
-        self.selection = self._selection()
+        self.chosen = where.selection  # what is in the arrays of ``selection``, which stay
+        self.selection = self.chosen._replace(ends=self.chosen.ends.clone(), weight=self.chosen.weight.clone())
         self.numbers = stepping.new_numbers(device)
         self.steps = torch.tensor([0, adam.count], dtype=torch.int32, device=device)
         self.told = torch.zeros(4 + len(self.order), dtype=torch.float64, device=device)
-        self.rays, self.read, self.read_rays = 0, np.zeros(len(self.told)), 0
+        self.rays, self.heard = 0, _Told(torch.zeros(len(self.told), dtype=torch.float64), None, 0)
         self.copies: list[_Told] = []
         self.flat, self.begins = self._flatten()
         self.rates = {n: torch.full((1,), adam.rates[n], device=device) for n in _TABLES}
@@ -141,10 +142,6 @@ class DeviceStep:
         self.pool: Any = None
         self.lamps: tuple[int, ...] = ()
         self.renew()
-
-    def _selection(self) -> kernels.Selection:
-        """Where rays are drawn, in arrays that stay."""
-        return self.where.selection._replace(ends=self.where.selection.ends.clone(), weight=self.where.selection.weight.clone())
 
     def _flatten(self) -> tuple[_Flat, dict[str, int]]:
         """Lay the small parameters one after the other, the shader's first, in the order that ``learn_all`` sums; where each begins."""
@@ -184,11 +181,6 @@ class DeviceStep:
             self.lamps if light is not None else (), decided and self.field.far_light is not None, gains, early, counts, empty,
         )  # fmt: skip
 
-    def select(self) -> None:
-        """Take up where rays go from now on."""
-        self.selection.ends.copy_(self.where.selection.ends)
-        self.selection.weight.copy_(self.where.selection.weight)
-
     def renew(self) -> None:
         """Take up what was changed between steps: lamps, tables of other sizes."""
         light = self.field.light
@@ -200,13 +192,17 @@ class DeviceStep:
         self.tables = tables
 
     def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, surface_factor: float) -> None:
-        """A step.
+        """A step, of rays where they go by now.
 
         Args:
             number: of the step, for its random numbers. factor: of all learning rates. surface_factor: of the surface's, beside.
         """
         if stage not in self.works:
             self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture, self.pool)
+        if self.where.selection is not self.chosen:
+            self.chosen = self.where.selection
+            self.selection.ends.copy_(self.chosen.ends)
+            self.selection.weight.copy_(self.chosen.weight)
         key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
         stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, surface_factor, key)
         self.works[stage]()
@@ -306,9 +302,9 @@ class DeviceStep:
         latest = None
         while len(self.copies) > (0 if wait else 1):
             latest = self.copies.pop(0)
-        if latest is None or not (more := latest.numbers.numpy() - self.read)[0]:
+        if latest is None or not (more := (latest.numbers - self.heard.numbers).numpy())[0]:
             return None
-        rays, self.read, self.read_rays = latest.rays - self.read_rays, latest.numbers.numpy().copy(), latest.rays
+        rays, self.heard = latest.rays - self.heard.rays, latest
         good = more[0] - more[1]
         mean = lambda total: float(total / good) if good else float("nan")
         errors = dict(zip(self.order, map(mean, more[4:]), strict=True))

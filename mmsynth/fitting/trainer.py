@@ -188,9 +188,7 @@ class Trainer:
         prepared = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided))
         if prepared != self.prepared:
             step.renew()
-        if prepared != self.prepared or state.step % _RENEW_EVERY == 0:
-            step.select()
-        self.prepared = prepared
+            self.prepared = prepared
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
         step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))

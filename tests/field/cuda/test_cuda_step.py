@@ -91,7 +91,7 @@ def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
 
 
 def test_arrays_that_graphs_hold_stay_or_the_graphs_go(device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the tables are as large as they should be nothing is replaced; larger ones and their moments are new, and so are the graphs."""
+    """Where tables are as large as they should be nothing is replaced; where others take the place of moments the graphs have to go."""
     if device != "cpu":
         pytest.skip("a fit on a GPU does it")
     few_looks(monkeypatch, rays=8)
