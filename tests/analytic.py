@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from conftest import look_at
 
 from mmsynth.field.field import Field
+from mmsynth.field.kernels import Sampling
 from mmsynth.field.picture import Rendering
 from mmsynth.scene.image_writers import write_npz, write_png16
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split
@@ -68,6 +70,7 @@ class AnalyticField:
         self.rig = {s.name: np.eye(4) for s in sensors}
         for i, s in enumerate(sensors):
             self.rig[s.name][0, 3] = 0.05 * i
+        self.sampling = Sampling(math.inf, 0.0, 1, 1)
         self.points, self.tile = 0, 8192  # that were asked for; rays at a time
         self.renders = 0
 

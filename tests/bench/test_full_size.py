@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from analytic import AnalyticField, scene_of, sphere
 
-from mmsynth.bench.full_size import full_size_camera, make_full_size, views_to_make
+from mmsynth.bench.full_size import as_hard_as_pixels, full_size_camera, make_full_size, views_to_make
 from mmsynth.errors import InputError
+from mmsynth.field.kernels import Sampling
 from mmsynth.scene.ground_truth import GroundTruth
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.load import load_scene
@@ -106,3 +107,18 @@ def test_cameras_of_all_scales_see_the_same(field: Any) -> None:
         scaled = full_size_camera(camera, scale)
         assert scaled.width == round(2464 * scale)
         np.testing.assert_allclose(corner(scaled), corner(camera), atol=1e-12)
+
+
+def test_surfaces_are_a_pixel_thick(field: Any, small: Scene) -> None:
+    field.sampling = Sampling(sharpness=20.0, step=0.05, active_surface=1, active_radiance=1)
+    camera = field.cameras["rgb"]
+    distance = np.median([np.linalg.norm(frame.camera_to_world[:3, 3]) for frame in small.frames])
+    for scale in (1.0, 0.5):
+        larger = full_size_camera(camera, scale)
+        hard = as_hard_as_pixels(field, small, dict.fromkeys(field.measured, larger))
+        pixel = distance / (0.5 * (larger.fx + larger.fy))
+        assert hard.sampling.sharpness * pixel == pytest.approx(4.0)
+        assert hard.sampling.step * hard.sampling.sharpness == pytest.approx(1.0)  # as many samples in the soft part as before
+        assert hard.sensors is field.sensors and field.sampling.sharpness == 20.0
+    field.sampling = hard.sampling._replace(sharpness=1e6)
+    assert as_hard_as_pixels(field, small, field.cameras) is field
