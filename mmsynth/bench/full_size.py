@@ -28,6 +28,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_text
+from mmsynth.fitting.needs import pixel_sizes
 from mmsynth.operations.output.progress import Counter, Progress, parts
 from mmsynth.operations.output.records import field_hash
 from mmsynth.operations.simulation.simulate import simulate
@@ -118,12 +119,11 @@ def as_hard_as_pixels(field: Field, scene: Scene, cameras: Mapping[str, Camera])
 
     Measured on a room that 160 x 120 pixels had taught, shown on 2464: surfaces 13 pixels thick, of which a fit's sharper ones took 4 dB.
     """
-    footprints = []
-    for name, camera in cameras.items():
-        origins = np.array([field.pose_of(frame)[:3, 3] for frame in scene.frames_of(name)])
-        distances = np.linalg.norm(origins - np.array(field.region.centre), axis=1) / field.region.radius
-        footprints.append(np.maximum(distances, 1.0) / (0.5 * (camera.fx + camera.fy)))
-    harder = _SHARPNESS / float(np.median(np.concatenate(footprints))) / field.sampling.sharpness
+    frames = [frame for name in cameras for frame in scene.frames_of(name)]
+    origins = np.array([field.pose_of(frame)[:3, 3] for frame in frames])
+    normalised = (origins - np.array(field.region.centre)) / field.region.radius
+    footprint = float(np.median(pixel_sizes(normalised, [cameras[frame.sensor] for frame in frames])))
+    harder = _SHARPNESS / footprint / field.sampling.sharpness
     if harder <= 1.0:
         return field
     hard = copy.copy(field)  # its tensors are shared

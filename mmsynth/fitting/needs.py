@@ -7,6 +7,7 @@ without a polarization sensor (heads follow the sensors), no grid level finer th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from mmsynth.fitting.measurements import Measurements, draw
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
 from mmsynth.scene.scene import MaskMeaning, Scene
+from mmsynth.sensors.camera import Camera
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
 _OUTERMOST = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
@@ -268,12 +270,17 @@ def _table_rows(f: _Facts) -> Choice[tuple[int, int]]:
 
 
 def _footprint(measurements: Measurements) -> float:
-    """Median over frames of a pixel's size at the region's centre, in radii; a camera inside counts as one radius away."""
-    sizes = []
-    for m in measurements.values():
-        focal = np.array([0.5 * (m.cameras[c].fx + m.cameras[c].fy) for c in m.camera_index])
-        sizes.append(np.maximum(np.linalg.norm(m.origins, axis=1), 1.0) / focal)
-    return float(np.median(np.concatenate(sizes)))
+    """Median over frames of a pixel's size at the region's centre, in radii."""
+    return float(np.median(np.concatenate([pixel_sizes(m.origins, [m.cameras[c] for c in m.camera_index]) for m in measurements.values()])))
+
+
+def pixel_sizes(origins: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Of each frame the size of a pixel at the region's centre, in radii (F,); a camera inside counts as one radius away.
+
+    Args:
+        origins: (F, 3) of cameras in the normalised frame. cameras: F of them.
+    """
+    return np.maximum(np.linalg.norm(origins, axis=1), 1.0) / np.array([0.5 * (c.fx + c.fy) for c in cameras])
 
 
 def _look_outside(measurements: Measurements, random: np.random.Generator) -> tuple[float, float, float, int]:
