@@ -3,7 +3,7 @@
 So a fit at full size has truth. The rays of every photosite are rendered by the field, at each scale anew (nothing is resampled), and a
 twin of the sensor (``operations/simulation``) records them: mosaic, noise, rounding. What the field does not know, no frame shows: there is
 no finer texture than its hash grids hold. Its surfaces are made as hard as the new pixels can tell: those of the small scene are a pixel of
-the small scene thick, a fog in which no surface is right (``as_hard_as_pixels``). Of rays along them some end for want of samples, black.
+the small scene thick, a fog in which no surface is right (``as_hard_as_pixels``).
 
 A scene has some of the small scene's views, test views among them, in an order in which each number of views holds those of all smaller
 numbers: a scene that was made with few views grows by making it again with more. Layout: that of ``simulate``, and of the test views ::

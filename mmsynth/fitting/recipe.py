@@ -105,7 +105,12 @@ class SamplingRecipe(_Section):
     step_width: float = _key(2.0, "Step between samples at the surface [1/sharpness].", gt=0)
     rendered_step_factor: float = _key(0.5, "Step of the finished field's renderings [step of the fit's end].", gt=0, le=1)
     sphere_step_factor: float = _key(0.7, "Share of the free distance that a ray goes at once, away from the surface [1].", gt=0, le=1)
-    min_slope: float = _key(0.5, "A ray that approaches the surface at less than this slope takes steps as if it had it [1].", gt=0, le=1)
+    min_slope: float = _key(
+        0.5,
+        "A ray that approaches the surface at less than this slope takes steps as if it had it, after many samples longer ones [1].",
+        gt=0,
+        le=1,
+    )
     min_section_weight: float = _key(1e-2, "Weight of a section below which it has no appearance of its own [1].", ge=0, lt=1)
     max_optical_depth: float = _key(3.0, "Optical depth at which a ray ends [1].", gt=0)
     occupancy_resolution: int = _key(96, "Cells of the occupancy grid along each axis [cells].", ge=8, le=256)

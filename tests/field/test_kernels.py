@@ -185,7 +185,7 @@ SAMPLINGS = {
     "soft": Sampling(40.0, 0.05, 3, 2),
     "sharp": Sampling(400.0, 0.005, 3, 2),
     "coarse": Sampling(10.0, 0.1, 2, 1, max_optical_depth=8.0, min_section_weight=0.05),  # not all levels
-    "slow": Sampling(20.0, 0.01, 3, 2, sphere_step_factor=0.1, min_slope=1.0),  # rays of the most samples
+    "slow": Sampling(20.0, 0.01, 3, 2, sphere_step_factor=0.1, min_slope=1.0, max_optical_depth=8.0),  # rays of the most samples
 }
 # what float32 leaves: most is lost in gradients that are sums of large numbers of both signs
 TOLERANCES = {
@@ -264,7 +264,8 @@ Rays = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def _smooth(parts: Parts, rays: Rays, sampling: Sampling) -> torch.Tensor:
-    """Rays at which nothing jumps within 1e-5: no unit that goes on or off, no face of a cell, no threshold. A matter of rounding."""
+    """Rays at which nothing jumps within 1e-5, no unit that goes on or off, no face of a cell, no threshold, and which such a shift
+    moves by little: what a ray that hardly meets a surface sees changes by a thousand times the rounding."""
     origins, directions, jitter = (x.detach().double() for x in rays)
     shift = 1e-5 * torch.randn(origins.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     below, here, above = (_quantities(parts, origins + k * shift, directions, jitter, sampling, exact=True)[0] for k in (-1, 0, 1))
@@ -273,6 +274,7 @@ def _smooth(parts: Parts, rays: Rays, sampling: Sampling) -> torch.Tensor:
         a, b, c = (x[name].detach().reshape(len(origins), -1) for x in (below, here, above))
         keep &= ((a.isnan() == b.isnan()) & (b.isnan() == c.isnan())).all(1)
         keep &= (a - 2 * b + c).nan_to_num().abs().amax(1) < 1e-4 * b.nan_to_num().abs().max()
+        keep &= (a - c).nan_to_num().abs().amax(1) < 1e-2 * b.nan_to_num().abs().max()
     return keep
 
 
@@ -303,7 +305,7 @@ def test_float32_is_fused_and_float64_is_not(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize("states", ["own", "open", "random"])
 @pytest.mark.parametrize("extent", [1.0, 2.0])
 def test_trace(extent: float, states: str, sampling: str) -> None:
-    parts, rays = _parts(extent, states, 1), _rays(350, 1)
+    parts, rays = _parts(extent, states, 7), _rays(350, 7)
     hits = _compare(parts, rays, SAMPLINGS[sampling])
     near, far = rendering.ball_interval(rays[0].detach(), rays[1].detach())
     assert (near == 0).sum() > 30 and (near == far).sum() > 20  # rays from within, rays that miss the ball

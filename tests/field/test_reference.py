@@ -337,8 +337,9 @@ def test_no_ray_takes_more_than_the_most_samples() -> None:
     small = Sampling(SHARPNESS, 1e-3, 1, 1)
     t, _, _ = reference.march(lambda x: 0 * x[:, 0], Rays(*ray, *rest), torch.zeros(8, 8, 8, dtype=torch.uint8), 1.0, small)
     assert len(t) == reference.MAX_SAMPLES_PER_RAY
-    # a distance that does not fall is stepped over with the least slope
-    torch.testing.assert_close(t.diff()[1:], torch.full((94,), 2e-3).double())
+    # a distance that does not fall is stepped over with the least slope; which halves with each sixth of the samples after the second
+    spent = torch.arange(1, 95) // 16
+    torch.testing.assert_close(t.diff()[1:], 2e-3 * 2.0 ** (spent - 1).clamp(min=0).double())
 
 
 # --- occupancy

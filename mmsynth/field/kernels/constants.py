@@ -8,6 +8,7 @@ HASH_PRIMES = (1, 2654435761, 805459861)  # along x, y, z (Müller et al. 2022, 
 FIRST_FEATURE_ROW = 4  # of what goes into the surface's network: x, y, z, 1, then features; columns of its weights alike
 
 MAX_SAMPLES_PER_RAY = 96
+STAGES = 6  # of these samples: in each but the first two the least slope is half of that before, or rays would run out along a surface
 LONGEST_STEP = 0.25  # of the distance from the centre, in contracted space
 LEAST_ADVANCE = 1.0 + 2.0**-22  # factor that a float32 moves on by at least: a short step far from a ray's origin may round to none
 SOFT_SURFACE = 3.0  # times 1 / sharpness: how far from the surface a ray may not yet stride

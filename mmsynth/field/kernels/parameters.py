@@ -75,7 +75,7 @@ class Sampling(NamedTuple):
         sharpness: s of the surface; its soft part is about 3.5 / s thick. step: between samples at the surface, in contracted
             space. active_surface, active_radiance: levels of the grids.
         sphere_step_factor: share of the free distance that a ray goes at once, away from the surface.
-        min_slope: a ray that approaches the surface at less than this slope steps as if it had it.
+        min_slope: a ray that approaches the surface at less than this slope steps as if it had it, see ``march``.
         min_section_weight: sections of a smaller weight are given no appearance of their own.
         max_optical_depth: optical depth at which a ray ends.
     """

@@ -27,6 +27,7 @@ from mmsynth.field.kernels.constants import (
     SHELL,
     SOFT_SURFACE,
     SOLID,
+    STAGES,
 )
 from mmsynth.field.kernels.drawing import draw as draw  # this, ``mirroring`` and ``shading`` are of the reference, too
 from mmsynth.field.kernels.drawing import odds as odds
@@ -167,8 +168,9 @@ def march(
     """Sample rays where the three-state grid says that a surface may be, guided by the distance at the samples.
 
     Outside cells are skipped, by the distance that they certify. From a sample with distance f, a ray goes on by
-    step / slope, the slope being how fast f fell since the last sample, or by ``sphere_step_factor`` (f - 3 / s) where that is longer. It
-    ends in a solid cell (at its second sample at the earliest), at an optical depth of ``max_optical_depth``, and after ``most`` samples.
+    step / slope, the slope being how fast f fell since the last sample, or by ``sphere_step_factor`` (f - 3 / s) where that is longer. The
+    slope counts as ``min_slope`` at the least, and as less when many samples are used up (``STAGES``). It ends in a solid cell (at its
+    second sample at the earliest), at an optical depth of ``max_optical_depth``, and after ``most`` samples.
 
     Args:
         sdf: (N, 3) → (N,). states: (G, G, G) uint8 over [-extent, extent]³; space is contracted when extent > 1.
@@ -196,7 +198,7 @@ def march(
             depth[here] += section_depth(before.double(), f.double(), s.sharpness, torch.full_like(f, k == 1, dtype=torch.bool)).to(f)
             slope = (last[1][here] - f) / ((at - last[0][here]) * speed)
         last[0][here], last[1][here] = at, f
-        jump = s.step / slope.clamp(min=s.min_slope)
+        jump = s.step / slope.clamp(min=s.min_slope / (1 << max(0, k * STAGES // most - 1)))
         jump = torch.where(f > 0, torch.maximum(jump, s.sphere_step_factor * (f - SOFT_SURFACE / s.sharpness)), jump) / speed
         if extent > 1:
             jump = torch.minimum(jump, LONGEST_STEP * reach)

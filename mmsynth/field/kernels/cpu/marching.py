@@ -30,6 +30,7 @@ from mmsynth.field.kernels.constants import (
     OUTSIDE,
     SOFT_SURFACE,
     SOLID,
+    STAGES,
 )
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
@@ -209,7 +210,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
             if tau_of[i] > sampling.max_optical_depth or k + 1 == MAX_SAMPLES_PER_RAY or (state_of[i] == SOLID and k > 0):
                 continue
             # the step that changes the distance by about ``step``: long where the ray grazes, and long far from the surface
-            jump = step / max(slope, min_slope)
+            jump = step / max(slope, min_slope / np.float32(1 << max(0, k * STAGES // MAX_SAMPLES_PER_RAY - 1)))
             if value > 0:
                 jump = max(jump, factor * (value - np.float32(SOFT_SURFACE / sharpness)))
             jump = jump / speed_of[i]

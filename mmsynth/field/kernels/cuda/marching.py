@@ -18,6 +18,7 @@ from mmsynth.field.kernels.cuda.shared import (
     OUTSIDE,
     SOFT_SURFACE,
     SOLID,
+    STAGES,
     contracted,
     jit,
     position,
@@ -146,7 +147,7 @@ def march_kernel(  # type: ignore[no-untyped-def]
         tl.store(at + plane, f, mask=met)
         tl.store(at + 2 * plane, tau, mask=met)
         slope = tl.where(later, (f0 - f) / tl.where(later, (t - t0) * speed, 1.0), 1.0)
-        jump = step / tl.maximum(slope, min_slope)
+        jump = step / tl.maximum(slope, min_slope / (1 << tl.maximum(k * STAGES // MAX_SAMPLES - 1, 0)).to(tl.float32))
         jump = tl.where(f > 0.0, tl.maximum(jump, sphere_step_factor * (f - soft)), jump) / speed
         if CONTRACTED:
             jump = tl.minimum(jump, reach * LONGEST_STEP)
