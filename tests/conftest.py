@@ -156,7 +156,11 @@ if INTERPRETED:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the tests of Triton, those with a ``device`` need a GPU or the interpreter; the others have nothing to do with the interpreter."""
+    """Of the tests of Triton, those with a ``device`` need a GPU or the interpreter; the others have nothing to do with the interpreter.
+
+    Slow tests come first: at the end one process would wait for another's.
+    """
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
     no_gpu = pytest.mark.skip(reason="needs a CUDA device")
     for item in items:
         if "field/cuda" not in item.path.as_posix():

@@ -201,6 +201,7 @@ def test_a_step_of_adam_comes_with_it(case: str, active: int, threads: int, monk
     _check_update(case, active)
 
 
+@pytest.mark.slow
 def test_a_step_of_adam_comes_with_it_on_many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """One test: more than two threads take kernels of their own, which take minutes to compile, and each process would."""
     monkeypatch.setattr(operations, "get_num_threads", lambda: 4)
