@@ -95,7 +95,7 @@ class Seen:
         return float(np.median(np.abs(self.depth - self.ball)[self.inside])) / RADIUS
 
 
-def fitted(light: Light, folder: Path, steps: int = 400, **recipe: object) -> Seen:
+def fitted(light: Light, folder: Path, steps: int = 400, seed: int = 0, **recipe: object) -> Seen:
     folder.mkdir(parents=True)
     frames = []
     for i in range(VIEWS):
@@ -104,7 +104,7 @@ def fitted(light: Light, folder: Path, steps: int = 400, **recipe: object) -> Se
     intrinsics = {"w": SIZE, "h": SIZE, "fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE / 2, "cy": SIZE / 2}
     (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
     scene = load_scene(folder)
-    field = fit(scene, folder / "run", recipe=Recipe().with_changes({**SMALL, **recipe}), steps=steps)
+    field = fit(scene, folder / "run", recipe=Recipe().with_changes({**SMALL, **recipe}), steps=steps, seed=seed)
     views = [frame for frame in scene.frames if frame.view in scene.split.test]
     shown = [field.render(frame.camera, frame.camera_to_world) for frame in views]
     assert all(np.isfinite(x.channels["rgb"]).all() for x in shown)
@@ -153,13 +153,18 @@ def glass(o: np.ndarray, d: np.ndarray) -> np.ndarray:
 def test_a_mirror_ball(tmp_path: Path, row: Row) -> None:
     """A mirror of a room is a room behind the surface, for who sees colours only: it stays so, but no worse than it was.
 
-    Seeds alone make 0.02 radii: four of them 0.39 to 0.42 painted, 0.35 to 0.41 ours."""
-    painted, ours = fitted(mirror_ball, tmp_path / "painted", **PAINTED), fitted(mirror_ball, tmp_path / "ours")
-    assert ours.off < painted.off + 0.02 and ours.psnr(ours.inside) > painted.psnr(ours.inside) - 0.5
+    Means of three seeds, each of which makes 0.02 radii."""
+    found = {}
+    for name, recipe in (("painted", PAINTED), ("ours", {})):
+        seen = [fitted(mirror_ball, tmp_path / f"{name}_{seed}", seed=seed, **recipe) for seed in range(3)]
+        found[name] = np.mean([(x.off, x.psnr(x.inside)) for x in seen], 0)
+    (usual_off, usual_psnr), (off, psnr) = found["painted"], found["ours"]
+    assert off < usual_off and psnr > usual_psnr - 0.5
     row(
-        "a ball that mirrors the room", f"painted: {painted.off:.2f} radii off, {painted.psnr(ours.inside):.1f} dB",
-        f"{ours.off:.2f} radii off, {ours.psnr(ours.inside):.1f} dB: not solved",
-    )  # fmt: skip
+        "a ball that mirrors the room",
+        f"painted: {usual_off:.2f} radii off, {usual_psnr:.1f} dB",
+        f"{off:.2f} radii off, {psnr:.1f} dB: not solved",
+    )
 
 
 def test_a_black_glossy_ball(tmp_path: Path, row: Row) -> None:
