@@ -158,9 +158,14 @@ if INTERPRETED:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of the tests of Triton, those with a ``device`` need a GPU or the interpreter; the others have nothing to do with the interpreter.
 
-    Slow tests come first: at the end one process would wait for another's.
+    Slow tests come first: at the end one process would wait for another's. Those that need no kernels come in the middle, where the second
+    of two processes begins: meanwhile the first one compiles, and kernels are compiled once.
     """
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    needs_none = [item.nodeid.startswith(("tests/scene/", "tests/sensors/")) for item in items]
+    others = [item for item, none in zip(items, needs_none, strict=True) if not none]
+    middle = len(items) // 2
+    items[:] = others[:middle] + [item for item, none in zip(items, needs_none, strict=True) if none] + others[middle:]
     no_gpu = pytest.mark.skip(reason="needs a CUDA device")
     for item in items:
         if "field/cuda" not in item.path.as_posix():

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from numba import get_num_threads
-
 from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, optimiser, shading, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.caching import remove_old_versions
 
@@ -16,12 +14,11 @@ KERNELS = (
     shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward, mirroring.reflect,
     learning.learn_rays, learning.finish, drawing.draw_rays, drawing.fill_odds, optimiser.adam_tensor,
 )  # fmt: skip
-_OF_MANY = learning.learn_rays_together, learning.finish_together  # more than two threads
 
 
 def is_compiled() -> bool:
     """Whether every kernel has code for its usual types, in this process or in the cache on disk."""
-    return all(k.signatures or _cached(k) for k in (*KERNELS, *(_OF_MANY if get_num_threads() > 2 else ())))
+    return all(k.signatures or _cached(k) for k in KERNELS)
 
 
 def remove_old_kernels() -> None:

@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
@@ -212,21 +212,6 @@ def learn_rays(  # type: ignore[no-untyped-def]
             return
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def learn_rays_together(  # type: ignore[no-untyped-def]
-    threads, next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
-    measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
-    g_gain,
-):  # fmt: skip
-    """``learn_rays``, by so many threads."""
-    for _ in prange(threads):
-        learn_rays(
-            next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view,
-            measured, gain, opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
-            g_mirrored, g_gain,
-        )  # fmt: skip
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
     """Add to the gradients of weights, biases and lamps what each chunk found: the sum of all that they are then, finite if each is."""
@@ -296,16 +281,3 @@ def finish(  # type: ignore[no-untyped-def]
     wait(done, 0)
     if math.isfinite(sums[0]) and math.isfinite(sums[1]):
         take_parts(next_task, level - appearance.active, len(done), done, places, numbers)
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def finish_together(  # type: ignore[no-untyped-def]
-    threads, next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient,
-    gradients, sums, places, numbers,
-):  # fmt: skip
-    """``finish``, by so many threads."""
-    for _ in prange(threads):
-        finish(
-            next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients,
-            sums, places, numbers,
-        )  # fmt: skip

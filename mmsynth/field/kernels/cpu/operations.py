@@ -380,7 +380,7 @@ def learn(
             *places_and_numbers(update() if update is not None else (), of_levels),
         )  # fmt: skip
 
-    finish = take_beside(to_finish, threads, learning.learn_rays, learning.learn_rays_together, to_learn)
+    finish = take_beside(to_finish, threads, learning.learn_rays, to_learn)
     loss = sums[0] = out.arrays.loss[:tasks].sum()
     if len(gain):
         by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
@@ -390,5 +390,5 @@ def learn(
     found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
     result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(drawn for _, drawn in to_fill))
     tell = meanwhile or (lambda _: None)
-    take_beside(lambda: tell(result), threads, learning.finish, learning.finish_together, finish)
+    take_beside(lambda: tell(result), threads, learning.finish, finish)
     return result

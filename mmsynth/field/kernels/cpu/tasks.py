@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
+from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -54,34 +56,38 @@ def wait(flags, index):  # type: ignore[no-untyped-def]
         pass
 
 
-_threads: list[ThreadPoolExecutor] = []
+@functools.cache
+def _beside(threads: int) -> ThreadPoolExecutor:
+    """They stay: starting one takes as long as what it does."""
+    return ThreadPoolExecutor(threads, "beside")
+
+
 if hasattr(os, "register_at_fork"):  # Unix: a forked process has none of its parent's threads
-    os.register_at_fork(after_in_child=_threads.clear)
+    os.register_at_fork(after_in_child=_beside.cache_clear)
 
 
-def take_beside(
-    meanwhile: Callable[[], T], threads: int, alone: Callable[..., None], together: Callable[..., None], arguments: tuple[Any, ...]
-) -> T:
+def take_beside(meanwhile: Callable[[], T], threads: int, kernel: Callable[..., None], arguments: tuple[Any, ...]) -> T:
     """What ``meanwhile`` gives, which a thread of its own does beside the tasks of a kernel; then it takes such tasks, too.
 
-    alone: the kernel, until no task is left. together: the same by so many threads, its first argument.
+    threads: in all. Each calls the kernel, which takes tasks until none is left and holds no lock of Python's. Numba's own threads would
+    need a kernel around it, which takes minutes to compile: all that it calls is made for it again.
     """
 
     def first_meanwhile() -> T:
         result = meanwhile()
-        alone(*arguments)
+        kernel(*arguments)
         return result
 
     if threads == 1:
         return first_meanwhile()
-    if not _threads:
-        _threads.append(ThreadPoolExecutor(1, "beside"))  # it stays: starting one takes as long as what it does
-    other = _threads[0].submit(first_meanwhile)
+    pool = _beside(threads - 1)
+    result = pool.submit(first_meanwhile)
+    others = [pool.submit(kernel, *arguments) for _ in range(threads - 2)]
     try:
-        if threads == 2:
-            alone(*arguments)
-        else:
-            together(threads - 1, *arguments)
+        kernel(*arguments)
     finally:
-        result = other.result()
-    return result
+        futures.wait([result])
+        futures.wait(others)
+    for other in others:
+        other.result()  # raises what it raised
+    return result.result()
