@@ -23,14 +23,17 @@ def processes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int,
 
     def run(count: int, gpus: int, fail: Any = None) -> list[tuple[str, str]]:
         fits: list[tuple[str, str]] = []
+        current = [0]
 
         def fit(scene: Any, run: Path, **options: Any) -> Any:
             fits.append((scene.name, options["device"]))
+            assert options["device"] == f"cuda:{current[0]}"  # what names no device means the process's own
             if fail is not None:
                 raise fail
             return SimpleNamespace(manifest={"train_psnr": {"rgb": 30.0}})
 
         monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+        monkeypatch.setattr(torch.cuda, "set_device", lambda index: current.__setitem__(0, index))
         monkeypatch.setattr(batch, "load_scene", lambda path, **options: SimpleNamespace(name=path.name))
         monkeypatch.setattr(batch, "fit", fit)
         monkeypatch.setattr(batch, "write_run_report", lambda *args, **options: None)

@@ -40,6 +40,8 @@ def partition_of_environment() -> WorkPartition:
 def local_device(device: str) -> str:
     """ "cuda" → the GPU of this process (torchrun's LOCAL_RANK, modulo how many there are); anything else as it is.
 
+    That GPU is the current one from then on: what names no device would take memory of the first GPU from each process.
+
     Raises:
         InputError: LOCAL_RANK is no whole number.
     """
@@ -48,4 +50,6 @@ def local_device(device: str) -> str:
     rank = os.environ.get("LOCAL_RANK", "0")
     if not rank.isdecimal():
         raise InputError(f"environment: LOCAL_RANK is {rank!r}, expected a whole number.")
-    return f"cuda:{int(rank) % torch.cuda.device_count()}"
+    index = int(rank) % torch.cuda.device_count()
+    torch.cuda.set_device(index)
+    return f"cuda:{index}"
