@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import learning
-from mmsynth.field.kernels.cpu import operations
+from mmsynth.field.kernels.cpu import operations, tasks
 from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
@@ -216,7 +217,9 @@ def test_nothing_moves_by_what_is_not_finite(what: str, dtype: torch.dtype, monk
     assert any(torch.isnan(g).any() for g in after[1::4]) and len(heard) == 1
 
 
-def test_what_fails_beside_the_kernels_is_raised() -> None:
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_what_fails_beside_the_kernels_is_raised(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(operations, "get_num_threads", lambda: threads)
     told, _ = _told(_step(*CASES["plain"]), torch.float32)
 
     def fails(*_: Any) -> Any:
@@ -226,6 +229,21 @@ def test_what_fails_beside_the_kernels_is_raised() -> None:
         with pytest.raises(LookupError, match="beside"):
             kernels.learn(told, (), *arguments)
     assert torch.isfinite(kernels.learn(told).loss)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_so_many_threads_take_tasks_at_once(threads: int) -> None:
+    """And a kernel that fails in one of them is heard of."""
+    all_there = threading.Barrier(threads)
+    assert tasks.take_beside(lambda: "meanwhile", threads, lambda seconds: all_there.wait(seconds), (60,)) == "meanwhile"
+
+    def fails_in_the_last(_: int) -> None:
+        if all_there.wait(60) == threads - 1:
+            raise MemoryError("in one thread")
+
+    for _ in range(4):
+        with pytest.raises(MemoryError, match="in one thread"):
+            tasks.take_beside(lambda: None, threads, fails_in_the_last, (0,))
 
 
 def test_far_light_is_what_a_ray_without_surface_shows() -> None:
