@@ -158,10 +158,10 @@ if INTERPRETED:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of the tests of Triton, those with a ``device`` need a GPU or the interpreter; the others have nothing to do with the interpreter.
 
-    Slow tests come first: at the end one process would wait for another's. Those that need no kernels come in the middle, where the second
-    of two processes begins: meanwhile the first one compiles, and kernels are compiled once.
+    Slow tests come first: at the end one process would wait for another's. Of these the viewer's are the first, which compile kernels;
+    tests that need none come in the middle, where the second of two processes begins: so one of the two compiles.
     """
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    items.sort(key=lambda item: (item.get_closest_marker("slow") is None, not item.nodeid.startswith("tests/viewer/")))
     needs_none = [item.nodeid.startswith(("tests/scene/", "tests/sensors/")) for item in items]
     others = [item for item, none in zip(items, needs_none, strict=True) if not none]
     middle = len(items) // 2
