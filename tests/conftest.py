@@ -162,10 +162,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     tests that need none come in the middle, where the second of two processes begins: so one of the two compiles.
     """
     items.sort(key=lambda item: (item.get_closest_marker("slow") is None, not item.nodeid.startswith("tests/viewer/")))
-    needs_none = [item.nodeid.startswith(("tests/scene/", "tests/sensors/")) for item in items]
-    others = [item for item, none in zip(items, needs_none, strict=True) if not none]
+    need_none = ("tests/scene/", "tests/sensors/")
+    others = [item for item in items if not item.nodeid.startswith(need_none)]
     middle = len(items) // 2
-    items[:] = others[:middle] + [item for item, none in zip(items, needs_none, strict=True) if none] + others[middle:]
+    items[:] = [*others[:middle], *(item for item in items if item.nodeid.startswith(need_none)), *others[middle:]]
     no_gpu = pytest.mark.skip(reason="needs a CUDA device")
     for item in items:
         if "field/cuda" not in item.path.as_posix():
