@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
-from mmsynth.field.kernels import SHELL, Cells, GridTable, SurfaceNetwork, reference
+from mmsynth.field.kernels import OUTSIDE, SHELL, Cells, GridTable, SurfaceNetwork, reference
 
 
 class Occupancy(nn.Module):
@@ -55,3 +55,7 @@ class Occupancy(nn.Module):
             return True
         self.states.fill_(SHELL)
         return False
+
+    def empty(self, cells: Tensor) -> None:
+        """Let rays pass cells, (G, G, G) bool, whatever the distance in them; the next update asks it again."""
+        self.states[cells.to(self.states.device)] = OUTSIDE

@@ -30,11 +30,15 @@ def ball_interval(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     return near, torch.maximum(middle + half, near)
 
 
+def beginning(origins: Tensor) -> Tensor:
+    """Where sampling of rays begins when all of space is seen, (R,): a surface right before a camera explains its picture and no other."""
+    return (FREE * (torch.linalg.vector_norm(origins, dim=-1) - 1.0)).clamp(min=NEAR)
+
+
 def interval(surface: Surface, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Where sampling of rays begins and ends: near, far (R,)."""
     if surface.grid.extent > 1.0:
-        # a surface right before a camera explains its picture and no other: there is none
-        near = (FREE * (torch.linalg.vector_norm(origins, dim=-1) - 1.0)).clamp(min=NEAR)
+        near = beginning(origins)
         return near, torch.full_like(near, FARTHEST)
     return ball_interval(origins, directions)
 

@@ -15,6 +15,7 @@ from small_scenes import FOCAL, HEIGHT, QUICK, RADIUS, WIDTH, around, look_from,
 
 from mmsynth.errors import InputError
 from mmsynth.field.field import Field
+from mmsynth.field.rendering import FREE
 from mmsynth.field.storage import load_field
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -22,7 +23,7 @@ from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.motion import matrix_to_motion, motion_to_matrix
 from mmsynth.scene.scene import Scene
-from mmsynth.sensors.camera import ray_map
+from mmsynth.sensors.camera import Camera, ray_map
 
 Row = Callable[[str, str, str], None]
 
@@ -400,3 +401,27 @@ def test_the_same_fit_twice(row: Row, tmp_path: Path, threads: int) -> None:
         f"gradients added in the order of the threads: {usual:.0%} of the sums differ from time to time",
         "equal to the last bit",
     )
+
+
+def test_matter_before_a_camera_that_no_picture_shows(row: Row, tmp_path: Path) -> None:
+    """The sphere around everything that a fit starts from: rays of the fit begin on this side of it, those of a view from afar beyond."""
+    recipe = QUICK.with_changes({
+        "surface.background": "on", "surface.initial_radius": 0.4, "surface.outer_radius": 1.4, "schedule.sharpness_start": 200.0,
+        "sampling.occupancy_resolution": 96,
+    })  # fmt: skip
+    poses = around(3)
+    field = _fit(tmp_path, {"rgb": poses}, steps=1, recipe=recipe)
+    far = poses[0] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    far[:3, 3] *= 1.8
+    away = np.linalg.norm((far[:3, 3] - field.region.centre) / field.region.radius)
+    middle = Camera(1, 1, 40.0, 40.0, 0.0, 0.0)
+    ours = float(field.render(middle, far).depth_ray[0, 0]) / field.region.radius
+    field.occupancy.update(field.surface.at(3), 200.0, torch.Generator().manual_seed(0), 1.0)  # by the distance alone
+    usual = float(field.render(middle, far).depth_ray[0, 0]) / field.region.radius
+    row(
+        f"matter before a camera that no picture shows, {away:.1f} radii from the centre",
+        f"by the distance alone: met after {usual:.2f} radii",
+        f"the ball behind it, after {ours:.2f}; exact {away - 0.4:.2f}",
+    )
+    assert usual == pytest.approx(FREE * (away - 1.0), abs=0.01)
+    assert ours == pytest.approx(away - 0.4, abs=0.05)
