@@ -22,6 +22,7 @@ from torch import Tensor
 from mmsynth.scene.motion import cross_matrix, matrix_to_motion, motion_to_matrix
 from mmsynth.scene.scene import Frame, Region
 
+SURE = 2.0  # standard errors of what motions save
 _HUBER = 0.5  # relative residuals beyond it count by their size and not by their square, as in the loss
 # of the region, where displacements in the picture are measured: its middle half
 _POINTS = 0.5 * np.array([*np.eye(3), *-np.eye(3), *(np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0) / np.sqrt(3.0)])
@@ -73,7 +74,32 @@ class NormalEquations:
 
     def of(self, *halves: int) -> NormalEquations:
         """Of one or both of the halves that ``normal_equations`` keeps apart."""
-        return NormalEquations(*(x[list(halves)].sum(0) for x in (self.matrix, self.vector, self.error, self.weight)))
+        return NormalEquations(*(x[list(halves)].sum(0) for x in self.parts))
+
+    def and_of(self, others: NormalEquations) -> NormalEquations:
+        """Of these rays and of others."""
+        return NormalEquations(*(a + b for a, b in zip(self.parts, others.parts, strict=True)))
+
+    @property
+    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return self.matrix, self.vector, self.error, self.weight
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What a step saves of the error of rays that it was not learned from, as shares of the error of all: in each frame (F,)."""
+
+    frames: np.ndarray
+
+    @property
+    def share(self) -> float:
+        """In all."""
+        return float(self.frames.sum())
+
+    @property
+    def unsure(self) -> float:
+        """Its standard error, by how much frames differ."""
+        return float(self.frames.std(ddof=1) * len(self.frames) ** 0.5)
 
 
 @dataclass(frozen=True)
@@ -177,26 +203,28 @@ def solve(equations: NormalEquations, layout: Layout, motions: Motions, views: b
 
 def cross_validated_step(
     equations: NormalEquations, layout: Layout, motions: Motions, views: bool, rig: bool, prior: float
-) -> tuple[Motions, float]:
+) -> tuple[Motions, Saved]:
     """The step of ``solve``, as long as rays that it was not learned from confirm, and the share of their error that it saves.
 
     Each half of the rays (2, F, ...) is solved for alone. The factors of the motions of views and of sensors at which the error of
-    the other half is least are signal / (signal + noise); all rays together have half the noise. Noise alone has a factor of 0.
+    the other half is least are signal / (signal + noise); all rays together have half the noise. Noise alone has a factor of 0, give
+    or take: the field learns from where cameras are put, so what is taken for a signal half of the time makes them walk off. A step
+    is shorter the less is sure to be saved, and none where that is less than ``SURE`` standard errors.
     """
     now = moved(layout, motions)
     here = _adjoint(now, now[layout.anchor][layout.view])
-    quadratic, linear = np.zeros((2, 2)), np.zeros(2)
+    quadratic, linear = np.zeros((len(now), 2, 2)), np.zeros((len(now), 2))
     for learned, other in ((0, 1), (1, 0)):
         step = solve(equations.of(learned), layout, motions, views, rig, prior)
         of_frames = np.stack([_times(here, step.views[layout.view]), step.sensors[layout.sensor]])
         judge = equations.of(other)
-        quadratic += np.einsum("kfi,fij,lfj->kl", of_frames, judge.matrix, of_frames)
-        linear += np.einsum("kfi,fi->k", of_frames, judge.vector)
-    factor = np.clip(-np.linalg.lstsq(quadratic, linear, rcond=1e-9)[0], 0.0, 1.0)
-    saved = -(2.0 * factor @ linear + factor @ quadratic @ factor) / float(equations.error.sum())
-    factor = 2.0 * factor / (1.0 + factor)
+        quadratic += np.einsum("kfi,fij,lfj->fkl", of_frames, judge.matrix, of_frames)
+        linear += np.einsum("kfi,fi->fk", of_frames, judge.vector)
+    factor = np.clip(-np.linalg.lstsq(quadratic.sum(0), linear.sum(0), rcond=1e-9)[0], 0.0, 1.0)
+    saved = Saved(-(2.0 * linear @ factor + np.einsum("k,fkl,l->f", factor, quadratic, factor)) / float(equations.error.sum()))
+    factor = 2.0 * factor / (1.0 + factor) * (max(0.0, 1.0 - (SURE * saved.unsure / saved.share) ** 2) if saved.share > 0 else 0.0)
     step = solve(equations.of(0, 1), layout, motions, views, rig, prior)
-    return Motions(factor[0] * step.views, factor[1] * step.sensors), float(saved)
+    return Motions(factor[0] * step.views, factor[1] * step.sensors), saved
 
 
 def fix_reference(layout: Layout, step: Motions, views: bool) -> Motions:

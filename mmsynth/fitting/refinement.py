@@ -17,7 +17,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements
-from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian
+from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian, Saved
 from mmsynth.fitting.recipe import PosesRecipe
 from mmsynth.scene.scene import Scene
 
@@ -76,7 +76,7 @@ class Refinement:
     """Motions of views and sensors, and whether they have any.
 
     ``decided`` is None until the evidence is in. A step sees some rays of every frame and moves the cameras; the field learns on
-    from where they are then.
+    from where they are then. What rays said that was not enough for a step (``unsure``) counts in the next.
     """
 
     def __init__(self, scene: Scene, measurements: Measurements, recipe: PosesRecipe, footprint: float, seed: int) -> None:
@@ -86,6 +86,7 @@ class Refinement:
         self.layout = poses.layout_of(frames, tuple(measurements), scene.region)
         self.motions = Motions(np.zeros((len(self.layout.views), 6)), np.zeros((len(self.layout.sensors), 6)))
         self.decided: MotionDecisions | None = None
+        self.unsure: NormalEquations | None = None
         self.steps, self.next = 0, recipe.start_at
         self.views_can = recipe.views != "off" and len(self.layout.views) > 1
         self.rig_can = recipe.rig != "off" and int(self.layout.free.sum()) > 1
@@ -120,25 +121,37 @@ class Refinement:
         if not self.decided.any:
             return
         views, rig = self.decided.views.value, self.decided.rig.value
+        if self.unsure is not None:
+            equations = self.unsure.and_of(equations)
         step, _ = poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)
+        self.unsure = None if step.views.any() or step.sensors.any() else equations
+        if self.unsure is not None:
+            return
         self.motions = poses.advance(self.layout, self.motions, poses.fix_reference(self.layout, step, views))
         self._set_poses()
 
     def _decide(self, equations: NormalEquations) -> MotionDecisions:
         """By the share of the error of rays not learned from that motions of views save beyond those of sensors, and the reverse."""
 
-        def saved(views: bool, rig: bool) -> float:
+        def saved(views: bool, rig: bool) -> np.ndarray:
             if not views and not rig:
-                return 0.0
-            return poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)[1]
+                return np.zeros(len(self.layout.view))
+            return poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)[1].frames
+
+        def worth(frames: np.ndarray) -> bool:
+            found = Saved(frames)
+            return found.share > max(self.recipe.min_improvement, poses.SURE * found.unsure)
 
         by_views, by_rig, by_both = saved(self.views_can, False), saved(False, self.rig_can), saved(self.views_can, self.rig_can)
-        worth = self.recipe.min_improvement
-        views, rig = by_both - by_rig > worth, by_both - by_views > worth
-        if not views and not rig and max(by_views, by_rig) > worth:
-            views, rig = by_views > by_rig, by_rig >= by_views  # one does as well as the other
-        why = "motions of {} would save {:.1%} of the error of rays not learned from, and cost {:.0e} rays of the fit"
-        return self._decisions(views, rig, why.format("views", by_views, _PER_FIT), why.format("sensors", by_rig, _PER_FIT))
+        views, rig = worth(by_both - by_rig), worth(by_both - by_views)
+        if not views and not rig and (worth(by_views) or worth(by_rig)):
+            views = bool(by_views.sum() > by_rig.sum())
+            rig = not views  # one does as well as the other
+        why = "motions of {} would save {:.1%} (±{:.1%}) of the error of rays not learned from, and cost {:.0e} rays of the fit"
+        of_views, of_rig = (
+            why.format(what, by.share, by.unsure, _PER_FIT) for what, by in (("views", Saved(by_views)), ("sensors", Saved(by_rig)))
+        )
+        return self._decisions(views, rig, of_views, of_rig)
 
     def _decisions(self, views: bool, rig: bool, of_views: str, of_rig: str) -> MotionDecisions:
         """What residuals want, and why, put to what the recipe wants and the scene allows."""
@@ -190,11 +203,13 @@ class Refinement:
     def state_dict(self) -> dict[str, Any]:
         views, sensors = torch.from_numpy(self.motions.views), torch.from_numpy(self.motions.sensors)
         decided = None if self.decided is None else asdict(self.decided)
-        return {"views": views, "sensors": sensors, "decided": decided, "steps": self.steps, "next": self.next}
+        unsure = None if self.unsure is None else [torch.from_numpy(part) for part in self.unsure.parts]
+        return {"views": views, "sensors": sensors, "decided": decided, "unsure": unsure, "steps": self.steps, "next": self.next}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.motions = Motions(state["views"].numpy(), state["sensors"].numpy())
         self.decided = TypeAdapter(MotionDecisions | None).validate_python(state["decided"])
+        self.unsure = None if state["unsure"] is None else NormalEquations(*(part.numpy() for part in state["unsure"]))
         self.steps, self.next = state["steps"], state["next"]
         if self.steps:
             self._set_poses()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +55,8 @@ def _still(layout: Layout) -> Motions:
 class Points:
     """A field that knows where N points are: a ray should pass through its own, and its residual is by how much it does not."""
 
-    def __init__(self, layout: Layout, true: np.ndarray, per_frame: int = 40, noise: float = 0.0) -> None:
-        random = np.random.default_rng(2)
+    def __init__(self, layout: Layout, true: np.ndarray, per_frame: int = 40, noise: float = 0.0, seed: int = 2) -> None:
+        random = np.random.default_rng(seed)
         self.frame = np.repeat(np.arange(len(true)), per_frame)
         self.points = random.uniform(-0.6, 0.6, (len(self.frame), 3))
         self.across = random.normal(size=(len(self.frame), 3))
@@ -137,10 +138,32 @@ def test_noise_alone_moves_nothing() -> None:
     equations = poses.normal_equations([Points(layout, now, noise=0.05).see(now)], now)
     for views, rig in ((True, False), (False, True), (True, True)):
         step, saved = poses.cross_validated_step(equations, layout, _still(layout), views, rig, prior=1.0)
-        alone = poses.solve(equations.of(0, 1), layout, _still(layout), views, rig, prior=1.0)
-        assert abs(saved) < 0.005
-        # what least squares alone would do to fit the noise
-        assert np.abs(step.views).max() + np.abs(step.sensors).max() < 0.35 * (np.abs(alone.views).max() + np.abs(alone.sensors).max())
+        assert abs(saved.share) < 0.005 and saved.share <= poses.SURE * saved.unsure
+        assert not step.views.any() and not step.sensors.any()
+
+
+def test_noise_is_seldom_taken_for_a_motion() -> None:
+    """As often as a normal number is beyond two standard errors, give or take; least squares always moves."""
+    layout = _layout(views=6)
+    moved = 0
+    for seed in range(100):
+        equations = poses.normal_equations([Points(layout, layout.poses, 20, 0.05, seed).see(layout.poses)], layout.poses)
+        step, _ = poses.cross_validated_step(equations, layout, _still(layout), True, False, prior=1.0)
+        moved += bool(step.views.any())
+    assert moved <= 8
+
+
+def test_looks_that_say_too_little_say_it_together() -> None:
+    """A motion that hides in the noise of one look and shows in sixteen."""
+    layout = _layout()
+    true = poses.moved(layout, _motions(layout, 0.005, rig=False))
+    looks = [poses.normal_equations([Points(layout, true, 10, 0.05, s).see(layout.poses)], layout.poses) for s in range(16)]
+    together = functools.reduce(lambda a, b: a.and_of(b), looks)
+    steps = [poses.cross_validated_step(x, layout, _still(layout), True, False, prior=1.0)[0] for x in (*looks, together)]
+    assert sum(bool(s.views.any()) for s in steps[:-1]) <= 4 and steps[-1].views.any()
+    assert _off(layout, Motions(steps[-1].views, _still(layout).sensors), true) < 0.8 * _off(layout, _still(layout), true)
+    rows = np.stack([x.error for x in looks]).sum(0)
+    assert together.error == pytest.approx(rows) and together.matrix.shape == looks[0].matrix.shape
 
 
 def test_a_motion_beside_noise_is_found_as_far_as_it_stands_out() -> None:
@@ -149,7 +172,7 @@ def test_a_motion_beside_noise_is_found_as_far_as_it_stands_out() -> None:
     field = Points(layout, true, noise=0.02)
     equations = poses.normal_equations([field.see(layout.poses)], layout.poses)
     _, saved = poses.cross_validated_step(equations, layout, _still(layout), True, True, prior=1.0)
-    assert 0.05 < saved < 1.0
+    assert 0.05 < saved.share < 1.0 and saved.share > 4.0 * saved.unsure
     assert _off(layout, _solved(layout, field, True, True), true) < 0.5 * _off(layout, _still(layout), true)
 
 
@@ -176,7 +199,7 @@ def test_frames_without_rays_follow_their_view_and_sensor_and_lone_ones_stay() -
     some = RayJacobian(*(x[keep] for x in (rows.frame, rows.residual, rows.by_origin, rows.by_direction, rows.directions)))
     equations = poses.normal_equations([some], layout.poses)
     step, saved = poses.cross_validated_step(equations, layout, _still(layout), True, True, prior=1.0)
-    assert saved > 0.5 and np.isfinite(step.views).all() and np.isfinite(step.sensors).all()
+    assert saved.share > 0.5 and np.isfinite(step.views).all() and np.isfinite(step.sensors).all()
     assert not step.views[3].any() and step.views[4].any()
 
 

@@ -15,7 +15,9 @@ from usual import nerfacc_keeps, neus_weights
 from mmsynth.errors import DivergedError
 from mmsynth.field.kernels import OUTSIDE, SHELL, Rays, ShadedRays, odds, reference
 from mmsynth.field.rendering import ball_interval
+from mmsynth.fitting import motions as poses
 from mmsynth.fitting.measurements import draw
+from mmsynth.fitting.motions import RayJacobian
 from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -274,3 +276,37 @@ def test_rays_are_bounded_where_residuals_are_out_of_date(row: Row) -> None:
         f"drawn in proportion to residuals, weighted: weights up to {heaviest[1e-6]:.0f}, {noise[1e-6]:.1f} times the noise of even draws",
         f"half of the rays evenly: up to {heaviest[0.5]:.1f}, {noise[0.5]:.1f} times the noise",
     )
+
+
+def test_cameras_in_their_places_do_not_walk_off(row: Row, scene: Scene) -> None:
+    """The field learns from where cameras were put, and rays then only say noise: 60 steps of refinement."""
+    trainer = _trainer(scene, **{"poses.views": "on", "poses.rig": "off"})
+    refinement = trainer.refinement
+    layout, prior = refinement.layout, refinement.prior
+    frames, away = len(layout.poses), float(np.linalg.norm(layout.poses[:, :3, 3], axis=1).mean())
+    equations = []
+
+    def look(_: dict[str, int], random: np.random.Generator) -> RayJacobian:
+        frame = np.repeat(np.arange(frames), 90)
+        across, local = random.normal(size=(len(frame), 3)), random.normal(size=(len(frame), 3)) * 0.3 + [0.0, 0.0, 1.0]
+        ahead = np.einsum("nij,nj->ni", layout.poses[frame, :3, :3], local / np.linalg.norm(local, axis=1, keepdims=True))
+        order = random.permutation(len(frame))
+        rows = frame, 0.1 * random.normal(size=len(frame)), 5.0 * across, 5.0 * away * across, ahead
+        found = RayJacobian(*(torch.from_numpy(x[order]) for x in rows))
+        equations.append(poses.normal_equations([found], layout.poses))
+        return found
+
+    def pixels(motions: poses.Motions) -> float:
+        return float(np.sqrt(np.einsum("vi,vij,vj->v", motions.views, layout.pixels[layout.anchor], motions.views).mean()))
+
+    for _ in range(60):
+        refinement.step(look, 0.5)
+    usual = poses.Motions(np.zeros_like(refinement.motions.views), refinement.motions.sensors)
+    for found in equations:
+        usual = poses.advance(layout, usual, poses.solve(found.of(0, 1), layout, usual, True, False, prior))
+    row(
+        "cameras in their places, noise in the rays",
+        f"least squares of {len(equations)} looks: {pixels(usual):.2f} pixels off",
+        f"{pixels(refinement.motions):.2f} pixels off",
+    )
+    assert pixels(usual) > 10.0 * pixels(refinement.motions)
