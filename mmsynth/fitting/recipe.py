@@ -155,7 +155,9 @@ class PosesRecipe(_Section):
     rig: Switch = _key("auto", "A rigid motion of every sensor but the first, the same in all views.")
     start_at: float = _key(0.3, "Progress at which residuals decide on motions, and from which cameras move [progress].", ge=0, le=1)
     min_improvement: float = _key(
-        0.01, "Share of the error of rays not learned from that motions must save [1], where they are auto.", gt=0
+        0.01,
+        "Share of the error of rays not learned from that motions must save [1], where they are auto; two standard errors at least.",
+        gt=0,
     )
 
 

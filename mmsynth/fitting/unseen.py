@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+import math
+from collections.abc import Collection
 
 import numpy as np
 import torch
 
 from mmsynth.field.rendering import beginning
 from mmsynth.fitting.measurements import Modality
-from mmsynth.sensors.camera import project
+from mmsynth.sensors.camera import Camera, project, unproject
+
+_AT_ONCE = 1 << 15  # cells
 
 
-def unseen_before_cameras(modalities: Iterable[Modality], resolution: int) -> np.ndarray:
+def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> np.ndarray:
     """Cells of contracted space that are nearer to a training camera than its rays begin, and that no training picture sees whole.
 
     That rays begin there says that nothing is before; where other cameras see something all the same, they are right. But what nobody sees
@@ -24,30 +28,39 @@ def unseen_before_cameras(modalities: Iterable[Modality], resolution: int) -> np
     Returns:
         (G, G, G) bool.
     """
-    frames = [
-        (m.cameras[c], rotation.astype(np.float64), origin.astype(np.float64), float(begin))
-        for m in modalities
-        for c, rotation, origin, begin in zip(m.camera_index, m.rotations, m.origins, beginning(torch.from_numpy(m.origins)), strict=True)
-    ]
+    origins = torch.from_numpy(np.concatenate([m.origins for m in modalities])).double()
+    begins = beginning(origins)
+    rotations = np.concatenate([m.rotations for m in modalities]).astype(np.float64)
+    cameras = [m.cameras[c] for m in modalities for c in m.camera_index]
     axis = (np.arange(resolution) + 0.5) * (4.0 / resolution) - 2.0
     cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     contracted = np.linalg.norm(cells, axis=1)
     number = np.flatnonzero((contracted > 1.0) & (contracted < 2.0))
     to_border = 2.0 - contracted[number, None]  # one over the distance from the centre
     points = cells[number] / (contracted[number, None] * to_border)
-    before = np.zeros(len(points), bool)
-    for _, _, origin, begin in frames:
-        before |= np.square(points - origin).sum(1) < begin**2
+    parts = torch.from_numpy(points).split(_AT_ONCE)
+    before = torch.cat([(torch.cdist(part, origins) < begins).any(1) for part in parts]).numpy()
     number, points = number[before], points[before]
     size = np.sqrt(3.0) * 2.0 / resolution / to_border[before, 0] ** 2  # half a diagonal of a cell, along the radius: longest there
     seen = np.zeros(len(points), bool)
-    for camera, rotation, origin, begin in frames:
-        away = np.linalg.norm(points - origin, axis=1)
-        asked = np.flatnonzero(~seen & (away - size >= begin))
-        pixels = project((points[asked] - origin) @ rotation, camera)
-        margin = max(camera.fx, camera.fy) * size[asked] / away[asked]
+    for camera, rotation, origin, begin in zip(cameras, rotations, origins.numpy(), begins.tolist(), strict=True):
+        ahead = points @ rotation[:, 2] - origin @ rotation[:, 2]
+        asked = np.flatnonzero(~seen & (ahead > _widest(camera) * begin))
+        local = (points[asked] - origin) @ rotation
+        away = np.linalg.norm(local, axis=1)
+        pixels, margin = project(local, camera), max(camera.fx, camera.fy) * size[asked] / away
         last = np.array([camera.width, camera.height]) - 1.0
-        seen[asked] = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
+        inside = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
+        seen[asked] = inside & (away - size[asked] >= begin)
     unseen = np.zeros(resolution**3, bool)
     unseen[number[~seen]] = True
     return unseen.reshape((resolution,) * 3)
+
+
+@functools.lru_cache(maxsize=256)
+def _widest(camera: Camera) -> float:
+    """Cosine of the widest angle between the axis and the border of a picture, -inf where that is a right angle or more, or unknown."""
+    u, v = np.linspace(0.0, camera.width - 1.0, 64), np.linspace(0.0, camera.height - 1.0, 64)
+    sides = [(u, np.full(64, end)) for end in v[[0, -1]]] + [(np.full(64, end), v) for end in u[[0, -1]]]
+    directions, valid = unproject(np.stack([np.concatenate(x) for x in zip(*sides, strict=True)], -1), camera)
+    return float(directions[:, 2].min()) if valid.all() and directions[:, 2].min() > 0 else -math.inf
