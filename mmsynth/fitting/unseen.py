@@ -13,7 +13,7 @@ from mmsynth.field.rendering import beginning
 from mmsynth.fitting.measurements import Modality
 from mmsynth.sensors.camera import Camera, project, unproject
 
-_AT_ONCE = 1 << 15  # cells
+_AT_ONCE = 1 << 13  # cells: their distances from all cameras are kept
 
 
 def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> np.ndarray:
@@ -32,16 +32,9 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> 
     begins = beginning(origins)
     rotations = np.concatenate([m.rotations for m in modalities]).astype(np.float64)
     cameras = [m.cameras[c] for m in modalities for c in m.camera_index]
-    axis = (np.arange(resolution) + 0.5) * (4.0 / resolution) - 2.0
-    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    contracted = np.linalg.norm(cells, axis=1)
-    number = np.flatnonzero((contracted > 1.0) & (contracted < 2.0))
-    to_border = 2.0 - contracted[number, None]  # one over the distance from the centre
-    points = cells[number] / (contracted[number, None] * to_border)
-    parts = torch.from_numpy(points).split(_AT_ONCE)
-    before = torch.cat([(torch.cdist(part, origins) < begins).any(1) for part in parts]).numpy()
-    number, points = number[before], points[before]
-    size = np.sqrt(3.0) * 2.0 / resolution / to_border[before, 0] ** 2  # half a diagonal of a cell, along the radius: longest there
+    every = np.arange(resolution**3)
+    parts = [_before_cameras(part, resolution, origins, begins) for part in np.array_split(every, -(-len(every) // _AT_ONCE))]
+    number, points, size = (np.concatenate(x) for x in zip(*parts, strict=True))
     seen = np.zeros(len(points), bool)
     for camera, rotation, origin, begin in zip(cameras, rotations, origins.numpy(), begins.tolist(), strict=True):
         ahead = points @ rotation[:, 2] - origin @ rotation[:, 2]
@@ -55,6 +48,19 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> 
     unseen = np.zeros(resolution**3, bool)
     unseen[number[~seen]] = True
     return unseen.reshape((resolution,) * 3)
+
+
+def _before_cameras(number: np.ndarray, resolution: int, origins: torch.Tensor, begins: torch.Tensor) -> tuple[np.ndarray, ...]:
+    """Of numbered cells those that are nearer to a camera than its rays begin: numbers (N,), centres (N, 3), half a diagonal (N,)."""
+    cells = (np.stack(np.unravel_index(number, (resolution,) * 3), -1) + 0.5) * (4.0 / resolution) - 2.0
+    contracted = np.linalg.norm(cells, axis=1)
+    outside = (contracted > 1.0) & (contracted < 2.0)
+    number, cells, contracted = number[outside], cells[outside], contracted[outside, None]
+    away = 1.0 / (2.0 - contracted)  # from the centre
+    points = cells / contracted * away
+    before = (torch.cdist(torch.from_numpy(points), origins) < begins).any(1).numpy()
+    # along the radius, where contracted space is stretched most
+    return number[before], points[before], np.sqrt(3.0) * 2.0 / resolution * away[before, 0] ** 2
 
 
 @functools.lru_cache(maxsize=256)
