@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
 
 from mmsynth.field.rendering import beginning
 from mmsynth.fitting.measurements import Modality
+from mmsynth.fitting.stored_frames import in_threads
 from mmsynth.sensors.camera import Camera, project, unproject
 
 _AT_ONCE = 1 << 13  # cells: their distances from all cameras are kept
+_GROUPS = 8  # of views, for threads
 
 
 def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> np.ndarray:
@@ -32,19 +34,12 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> 
     begins = beginning(origins)
     rotations = np.concatenate([m.rotations for m in modalities]).astype(np.float64)
     cameras = [m.cameras[c] for m in modalities for c in m.camera_index]
-    every = np.arange(resolution**3)
-    parts = [_before_cameras(part, resolution, origins, begins) for part in np.array_split(every, -(-len(every) // _AT_ONCE))]
-    number, points, size = (np.concatenate(x) for x in zip(*parts, strict=True))
-    seen = np.zeros(len(points), bool)
-    for camera, rotation, origin, begin in zip(cameras, rotations, origins.numpy(), begins.tolist(), strict=True):
-        ahead = points @ rotation[:, 2] - origin @ rotation[:, 2]
-        asked = np.flatnonzero(~seen & (ahead > _widest(camera) * begin))
-        local = (points[asked] - origin) @ rotation
-        away = np.linalg.norm(local, axis=1)
-        pixels, margin = project(local, camera), max(camera.fx, camera.fy) * size[asked] / away
-        last = np.array([camera.width, camera.height]) - 1.0
-        inside = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
-        seen[asked] = inside & (away - size[asked] >= begin)
+    views = list(zip(cameras, rotations, origins.numpy(), begins.tolist(), strict=True))
+    parts = np.array_split(np.arange(resolution**3), -(-(resolution**3) // _AT_ONCE))
+    before = in_threads(lambda i: _before_cameras(parts[i], resolution, origins, begins), len(parts))
+    number, points, size = (np.concatenate(x) for x in zip(*before, strict=True))
+    groups = min(_GROUPS, len(views))
+    seen = np.any(in_threads(lambda i: _seen_whole(points, size, views[i::groups]), groups), axis=0)
     unseen = np.zeros(resolution**3, bool)
     unseen[number[~seen]] = True
     return unseen.reshape((resolution,) * 3)
@@ -61,6 +56,27 @@ def _before_cameras(number: np.ndarray, resolution: int, origins: torch.Tensor, 
     before = (torch.cdist(torch.from_numpy(points), origins) < begins).any(1).numpy()
     # along the radius, where contracted space is stretched most
     return number[before], points[before], np.sqrt(3.0) * 2.0 / resolution * away[before, 0] ** 2
+
+
+def _seen_whole(points: np.ndarray, size: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray, float]]) -> np.ndarray:
+    """Which cells, by their centres (N, 3) and half diagonals (N,), are whole in a picture and beyond where its rays begin (N,).
+
+    Args:
+        views: camera, rotation (3, 3) and origin (3,) of each, and where its rays begin.
+    """
+    seen = np.zeros(len(points), bool)
+    for camera, rotation, origin, begin in views:
+        widest = _widest(camera)
+        # most cells are not before a camera: what is known by the distance along its axis is asked no more
+        asked = np.flatnonzero(~seen & (points @ rotation[:, 2] - origin @ rotation[:, 2] > widest * begin))
+        local = (points[asked] - origin) @ rotation
+        away = np.sqrt(np.einsum("ni,ni->n", local, local))
+        kept = (local[:, 2] > widest * away) & (away - size[asked] >= begin)
+        asked, local, away = asked[kept], local[kept], away[kept]
+        pixels, margin = project(local, camera), max(camera.fx, camera.fy) * size[asked] / away
+        last = np.array([camera.width, camera.height]) - 1.0
+        seen[asked] = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
+    return seen
 
 
 @functools.lru_cache(maxsize=256)
