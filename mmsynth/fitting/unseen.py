@@ -14,7 +14,7 @@ from mmsynth.fitting.measurements import Modality
 from mmsynth.fitting.stored_frames import in_threads
 from mmsynth.sensors.camera import Camera, project, unproject
 
-_AT_ONCE = 1 << 13  # cells: their distances from all cameras are kept
+_AT_ONCE = 1 << 14  # cells
 _GROUPS = 8  # of views, for threads
 
 
@@ -30,11 +30,11 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> 
     Returns:
         (G, G, G) bool.
     """
-    origins = torch.from_numpy(np.concatenate([m.origins for m in modalities])).double()
-    begins = beginning(origins)
+    origins = np.concatenate([m.origins for m in modalities]).astype(np.float64)
+    begins = beginning(torch.from_numpy(origins)).numpy()
     rotations = np.concatenate([m.rotations for m in modalities]).astype(np.float64)
     cameras = [m.cameras[c] for m in modalities for c in m.camera_index]
-    views = list(zip(cameras, rotations, origins.numpy(), begins.tolist(), strict=True))
+    views = list(zip(cameras, rotations, origins, begins, strict=True))
     parts = np.array_split(np.arange(resolution**3), -(-(resolution**3) // _AT_ONCE))
     before = in_threads(lambda i: _before_cameras(parts[i], resolution, origins, begins), len(parts))
     number, points, size = (np.concatenate(x) for x in zip(*before, strict=True))
@@ -45,15 +45,19 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> 
     return unseen.reshape((resolution,) * 3)
 
 
-def _before_cameras(number: np.ndarray, resolution: int, origins: torch.Tensor, begins: torch.Tensor) -> tuple[np.ndarray, ...]:
+def _before_cameras(number: np.ndarray, resolution: int, origins: np.ndarray, begins: np.ndarray) -> tuple[np.ndarray, ...]:
     """Of numbered cells those that are nearer to a camera than its rays begin: numbers (N,), centres (N, 3), half a diagonal (N,)."""
     cells = (np.stack(np.unravel_index(number, (resolution,) * 3), -1) + 0.5) * (4.0 / resolution) - 2.0
-    contracted = np.linalg.norm(cells, axis=1)
-    outside = (contracted > 1.0) & (contracted < 2.0)
+    contracted = np.sqrt(np.einsum("ni,ni->n", cells, cells))
+    reach = float((np.linalg.norm(origins, axis=1) + begins).max())  # nothing is before a camera beyond it
+    outside = (contracted > 1.0) & (contracted < 2.0 - 1.0 / reach)
     number, cells, contracted = number[outside], cells[outside], contracted[outside, None]
     away = 1.0 / (2.0 - contracted)  # from the centre
     points = cells / contracted * away
-    before = (torch.cdist(torch.from_numpy(points), origins) < begins).any(1).numpy()
+    before = np.zeros(len(points), bool)
+    for origin, begin in zip(origins, begins, strict=True):
+        between = points - origin
+        before |= np.einsum("ni,ni->n", between, between) < begin**2
     # along the radius, where contracted space is stretched most
     return number[before], points[before], np.sqrt(3.0) * 2.0 / resolution * away[before, 0] ** 2
 
@@ -68,8 +72,8 @@ def _seen_whole(points: np.ndarray, size: np.ndarray, views: Sequence[tuple[Came
     for camera, rotation, origin, begin in views:
         widest = _widest(camera)
         # most cells are not before a camera: what is known by the distance along its axis is asked no more
-        asked = np.flatnonzero(~seen & (points @ rotation[:, 2] - origin @ rotation[:, 2] > widest * begin))
-        local = (points[asked] - origin) @ rotation
+        asked = np.flatnonzero(~seen & (np.einsum("ni,i->n", points, rotation[:, 2]) - origin @ rotation[:, 2] > widest * begin))
+        local = np.einsum("ni,ij->nj", points[asked] - origin, rotation)
         away = np.sqrt(np.einsum("ni,ni->n", local, local))
         kept = (local[:, 2] > widest * away) & (away - size[asked] >= begin)
         asked, local, away = asked[kept], local[kept], away[kept]
