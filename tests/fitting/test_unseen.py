@@ -86,7 +86,7 @@ def test_no_ray_of_a_picture_passes_unseen_cells(seed: int, count: int, fisheye:
         assert not unseen[_cell(points[inside])].any()
 
 
-def test_in_every_unit_and_for_many_cameras_in_one_place() -> None:
+def test_many_cameras_in_one_place_are_as_one() -> None:
     """All cells that count as unseen lie before a camera: nearer than where its rays begin."""
     stand = [0.0, 0.0, 2.2]
     poses = np.repeat(_looking_inwards([stand]), 5, axis=0)

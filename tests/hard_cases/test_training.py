@@ -309,4 +309,5 @@ def test_cameras_in_their_places_do_not_walk_off(row: Row, scene: Scene) -> None
         f"least squares of {len(equations)} looks: {pixels(usual):.2f} pixels off",
         f"{pixels(refinement.motions):.2f} pixels off",
     )
-    assert pixels(usual) > 10.0 * pixels(refinement.motions)
+    # 0.026 where steps are as long as the other half of the rays confirms, sure or not
+    assert pixels(usual) > 0.3 and pixels(refinement.motions) < 0.01
