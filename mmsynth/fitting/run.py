@@ -31,7 +31,7 @@ from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.signals import delayed_signals
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.trainer import Trainer
-from mmsynth.fitting.unseen import unseen_before_cameras
+from mmsynth.fitting.unseen import unmet_cells, unseen_before_cameras
 from mmsynth.prior.prediction import common, predict, scene_facts
 from mmsynth.prior.prior import Prior
 from mmsynth.scene.exposure import Exposure, stated_exposure
@@ -220,7 +220,7 @@ def _rendered_sampling(trainer: Trainer) -> Sampling:
 
 
 def _finished(trainer: Trainer) -> Field:
-    """The field with the mean of its last parameters, the step of its renderings, nothing before cameras and the corrected poses."""
+    """The field with the mean of its last parameters, the step of its renderings, nothing where nobody looked, and the corrected poses."""
     field = trainer.field
     trainer.average.apply()
     field.sampling = _rendered_sampling(trainer)
@@ -229,6 +229,8 @@ def _finished(trainer: Trainer) -> Field:
     if field.design.background:
         unseen = unseen_before_cameras(trainer.measurements.values(), len(field.occupancy.states))
         field.occupancy.empty(torch.from_numpy(unseen))
+    elif trainer.has_opacity or trainer.needs.black_background:
+        field.occupancy.empty(unmet_cells(field, trainer.measurements, np.random.default_rng((trainer.seed, 12))))
     field.corrections = trainer.refinement.corrections()
     field.rig = {n: pose @ field.corrections.sensors.get(n, np.eye(4)) for n, pose in field.rig.items()}
     return field

@@ -1,4 +1,4 @@
-"""Space right before the cameras that no picture tells of."""
+"""Space that no picture tells of: right before the cameras, and where nothing that is there was ever met."""
 
 from __future__ import annotations
 
@@ -8,14 +8,48 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d
 
-from mmsynth.field.rendering import beginning
-from mmsynth.fitting.measurements import Modality
+from mmsynth.field import kernels
+from mmsynth.field.field import Field
+from mmsynth.field.rendering import beginning, trace
+from mmsynth.fitting.measurements import Measurements, Modality, draw
 from mmsynth.fitting.stored_frames import in_threads
 from mmsynth.sensors.camera import Camera, project, unproject
 
 _AT_ONCE = 1 << 14  # cells
 _GROUPS = 8  # of views, for threads
+_RAYS, _RAYS_AT_ONCE = 1 << 17, 1 << 15  # that look for surfaces
+_LEAST_SHARE = 0.05  # of a ray's light, which a surface must give to be met
+_AROUND = 2  # cells around one in which a surface is met, in which it may go on
+
+
+@torch.no_grad()
+def unmet_cells(field: Field, measurements: Measurements, random: np.random.Generator) -> Tensor:
+    """Cells with matter in which random training rays, and in two cells around, meet no surface.
+
+    Where pictures say that there is nothing outside of the object, rays carve it out of the sphere that a fit starts from. What they never
+    reach, beneath a table that is seen from above, stays what it was, and a new view from below would see it: a ghost.
+
+    Args:
+        field: finished, with the occupancy of its distance.
+    Returns:
+        (G, G, G) bool.
+    """
+    states = field.occupancy.states
+    met = torch.zeros_like(states, dtype=torch.bool)
+    half, last = len(states) / (2.0 * field.occupancy.extent), len(states) - 1
+    for _ in range(_RAYS // _RAYS_AT_ONCE):
+        batch = draw(measurements, None, dict.fromkeys(measurements, max(1, _RAYS_AT_ONCE // len(measurements))), random)
+        middle = torch.full((len(batch.origins),), 0.5, device=states.device)
+        hits = trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, middle, field.sampling)
+        ray = kernels.rays_of(hits.behind, len(hits.share))
+        points = field.surface.grid.to_grid(batch.origins[ray] + batch.directions[ray] * hits.distance[:, None])
+        cells = ((points[(hits.share > _LEAST_SHARE) & (hits.distance > 0)] + field.occupancy.extent) * half).long().clamp(0, last)
+        met[cells.unbind(-1)] = True
+    near = max_pool3d(met[None, None].float(), 2 * _AROUND + 1, 1, _AROUND)[0, 0] > 0
+    return (states < kernels.OUTSIDE) & ~near
 
 
 def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> np.ndarray:

@@ -425,3 +425,34 @@ def test_matter_before_a_camera_that_no_picture_shows(row: Row, tmp_path: Path) 
     )
     assert usual == pytest.approx(FREE * (away - 1.0), abs=0.01)
     assert ours == pytest.approx(away - 0.4, abs=0.05)
+
+
+def test_matter_that_no_picture_reaches(row: Row, tmp_path: Path) -> None:
+    """The lower half of the sphere that a fit starts from, seen from above alone: a view from the side would see it all the same."""
+    recipe = QUICK.with_changes({"schedule.sharpness_start": 200.0, "sampling.occupancy_resolution": 96})
+    above = [look_from((0.5 * math.cos(i), 0.5 * math.sin(i), 2.6)) for i in range(5)]
+    field = _fit(tmp_path, {"rgb": above}, steps=1, recipe=recipe)
+    side, middle = look_from((2.6, 0.0, 0.0)) @ np.diag([1.0, -1.0, -1.0, 1.0]), Camera(1, 1, 40.0, 40.0, 0.0, 0.0)
+    side[:3, 3] = field.region.centre + field.region.radius * np.array([2.6, 0.0, 0.0])
+    lenses = [above[0] @ np.diag([1.0, -1.0, -1.0, 1.0]), above[3] @ np.diag([1.0, -1.0, -1.0, 1.0])]
+    wide = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
+
+    def looks() -> tuple[list[float], np.ndarray]:
+        heights = []
+        for z in (0.35, -0.35):
+            pose = side.copy()
+            pose[2, 3] += field.region.radius * z
+            heights.append(float(field.render(middle, pose).opacity[0, 0]))
+        return heights, np.stack([field.render(wide, pose).channels["rgb"] for pose in lenses])
+
+    (top, bottom), seen = looks()
+    field.occupancy.update(field.surface.at(3), 200.0, torch.Generator().manual_seed(0), 1.0)  # by the distance alone
+    (usual_top, usual_bottom), usual = looks()
+    row(
+        "a ball seen from above alone, its lower half from the side",
+        f"by the distance alone: opacity {usual_bottom:.2f}",
+        f"{bottom:.2f}; the upper half {top:.2f}",
+    )
+    assert usual_top > 0.99 and usual_bottom > 0.99
+    assert top > 0.99 and bottom == 0.0
+    assert np.abs(seen - usual).max() < 0.02  # at the limb, along which light is met over a fifth of a radius
