@@ -24,7 +24,7 @@ from mmsynth.scene.scene import Scene
 _AT_ONCE = 2048  # rays of a batch: all that it goes through is kept for the way back
 _DECIDE = 16  # batches at least, by which it is decided
 _PER_STEP, _PER_VIEW = 4096, 64  # rays of a step at least
-_PER_FIT = 400_000  # rays from the beginning to the end of a fit
+_PER_FIT = 400_000  # rays from the beginning to the end of a fit, where each step moves cameras
 _PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
 
 Look = Callable[[dict[str, int], np.random.Generator], RayJacobian]
@@ -76,7 +76,8 @@ class Refinement:
     """Motions of views and sensors, and whether they have any.
 
     ``decided`` is None until the evidence is in. A step sees some rays of every frame and moves the cameras; the field learns on
-    from where they are then. What rays said that was not enough for a step (``unsure``) counts in the next.
+    from where they are then. What rays said that was not enough for a step (``unsure``) counts in the next, which waits as long as looks
+    were in vain.
     """
 
     def __init__(self, scene: Scene, measurements: Measurements, recipe: PosesRecipe, footprint: float, seed: int) -> None:
@@ -125,7 +126,8 @@ class Refinement:
             equations = self.unsure.and_of(equations)
         step, _ = poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)
         self.unsure = None if step.views.any() or step.sensors.any() else equations
-        if self.unsure is not None:
+        if self.unsure is not None:  # looks in vain cost as much as others: the more there were, the later the next
+            self.next = progress + max(rays, float(self.unsure.weight.sum())) / _PER_FIT
             return
         self.motions = poses.advance(self.layout, self.motions, poses.fix_reference(self.layout, step, views))
         self._set_poses()

@@ -147,6 +147,33 @@ def test_a_look_at_rays_leaves_the_next_step_alone(scene: Scene) -> None:
     assert all(p.requires_grad for p in trainer.field.parameters())
 
 
+def test_looks_in_vain_come_ever_later_until_one_says_something(scene: Scene) -> None:
+    refinement = Trainer(scene, _recipe(**{"poses.views": "on", "poses.rig": "off"}), STEPS, None, 0, "cpu").refinement
+    layout, off = refinement.layout, np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0])
+    frame = torch.from_numpy(np.random.default_rng(0).permutation(np.repeat(np.arange(len(layout.poses)), 90)))
+    rotations = torch.from_numpy(layout.poses[:, :3, :3])[frame]
+    signal = 0.0
+
+    def look(_: dict[str, int], random: np.random.Generator) -> poses.RayJacobian:
+        across, ahead = (torch.from_numpy(random.normal(size=(len(frame), 3))) for _ in range(2))
+        rows = poses.RayJacobian(frame, torch.zeros(len(frame)), across, 2.0 * across, ahead / ahead.norm(dim=1, keepdim=True))
+        noise = 0.1 * torch.from_numpy(random.normal(size=len(frame)))
+        return dataclasses.replace(rows, residual=noise + signal * poses.derivative(rows, rotations) @ torch.from_numpy(off))
+
+    looks = [refinement.recipe.start_at]
+    for _ in range(8):
+        assert refinement.due(looks[-1]) and not refinement.due(looks[-1] - 1e-6)
+        refinement.step(look, looks[-1])
+        looks.append(refinement.next)
+    waits = np.diff(looks)
+    assert not refinement.motions.views.any() and (np.diff(waits) > 0).all()
+    signal = 1.0
+    before = refinement.next
+    while not refinement.motions.views.any():
+        refinement.step(look, before := refinement.next)
+    assert refinement.next - before < 0.5 * waits[1]
+
+
 @pytest.mark.parametrize("views", [2.0, 0.0])
 def test_a_broken_off_refinement_goes_on_to_the_same_field(scene: Scene, tmp_path: Path, views: float) -> None:
     off = _disturbed(keep_frames(scene, {"mono": 4, "pol": 4}), views, 0.0)
