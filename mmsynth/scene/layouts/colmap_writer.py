@@ -20,6 +20,7 @@ from mmsynth.sensors.camera import Camera
 _CAMERA = 0  # the type of a sensor, beside IMUs
 _NUMBERS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 _SAME = 1e-10  # of a rotation's entries, and of a distance over the cameras' extent: poses of one rig
+_ROUNDING = 64 * np.finfo(float).eps  # of a coordinate, of what two inverses and a product leave
 Images = Mapping[str, Mapping[int, PosedCamera]]
 """By sensor and view: the camera, its pose, and the picture's name below ``images/``."""
 
@@ -35,7 +36,8 @@ class RigPoses:
 def rig_of(images: Images) -> RigPoses | None:
     """The rig on which sensors stand; None where their poses differ from a rigid rig's, share no views, or a sensor has several cameras."""
     positions = np.stack([view.camera_to_world[:3, 3] for own in images.values() for view in own.values()])
-    extent = max(float(np.linalg.norm(positions - positions.mean(0), axis=1).max()), 1e-12)
+    extent = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    near = _SAME * extent + _ROUNDING * float(np.abs(positions).max())
     waiting = {name: {view: np.linalg.inv(posed.camera_to_world) for view, posed in own.items()} for name, own in images.items()}
     first = next(iter(waiting))
     rig = RigPoses(dict(waiting.pop(first)), {first: np.eye(4)})
@@ -50,7 +52,7 @@ def rig_of(images: Images) -> RigPoses | None:
             stands = rig.rig_from_world.setdefault(view, np.linalg.inv(place) @ pose)
             # where the camera is, not its translation: a world far from its origin has that in every digit
             apart = np.linalg.inv(place @ stands)[:3, 3] - np.linalg.inv(pose)[:3, 3]
-            if np.abs((place @ stands - pose)[:3, :3]).max() > _SAME or np.linalg.norm(apart) > _SAME * extent:
+            if np.abs((place @ stands - pose)[:3, :3]).max() > _SAME or np.linalg.norm(apart) > near:
                 return None
     one_camera = all(len({posed.camera for posed in own.values()}) == 1 for own in images.values())
     return rig if one_camera else None

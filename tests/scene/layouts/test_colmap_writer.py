@@ -101,6 +101,21 @@ def test_a_rig(tmp_path: Path, lenses: tuple[Camera, ...], of_rig: list[np.ndarr
         assert len(of_frame) == 1
 
 
+@pytest.mark.parametrize("far", [0.0, 1.0, 1e3, 1e7])
+def test_a_rig_that_only_turns_far_from_the_origin(tmp_path: Path, far: float) -> None:
+    """There is no extent to measure rounding by."""
+    camera, turned = Camera(16, 16, 16.0, 16.0, 8.0, 8.0), np.eye(4)
+    turned[:3, 3] = 0.3 * far, -far, 0.7 * far
+    of_rig = {0: turned, 1: turned.copy(), 2: turned.copy()}
+    for view, pose in of_rig.items():
+        pose[:3, :3] = Rotation.from_rotvec([0.3, -0.7 * view, 0.2]).as_matrix()
+    images = {name: {view: PosedCamera(camera, of_rig[view], f"{name}/{view}.png") for view in of_rig} for name in ("rgb", "nir")}
+    assert len(written(tmp_path, images).rigs) == 1
+    images["nir"][1] = PosedCamera(camera, of_rig[1].copy(), "nir/1.png")
+    of_rig[1][:3, 3] += 1e-6 * max(far, 1.0)
+    assert len(written(tmp_path, images).rigs) == 2
+
+
 def test_sensors_that_stand_loose_are_no_rig(tmp_path: Path) -> None:
     camera = Camera(64, 48, 60.0, 60.0, 31.0, 23.0)
     place, loose = np.eye(4), np.eye(4)
