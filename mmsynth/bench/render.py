@@ -196,10 +196,7 @@ def judge(case: RenderCase, variant: Variant, found: Outputs) -> dict[str, float
 def _samples(case: RenderCase, variant: Variant) -> float:
     field, total = case.field, 0
     for origins, directions, _ in case.rays.tiles(TILE):
-        middle = torch.full((len(origins),), 0.5)
-        total += int(
-            rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, variant.sampling).samples
-        )
+        total += int(field.trace(origins, directions, variant.sampling).samples)
     return total / len(case.rays)
 
 

@@ -153,6 +153,11 @@ class Field(nn.Module):
         values = [self.surface(self.surface.grid.to_grid(part), self.sampling.active_surface) for part in parts]
         return torch.cat(values).cpu().numpy() * np.float32(self.region.radius) if values else np.empty(0, np.float32)
 
+    def trace(self, origins: Tensor, directions: Tensor, sampling: Sampling) -> rendering.Hits:
+        """What rays of the normalised frame meet, (R, 3) each, with samples in the middle of their steps: see ``rendering.trace``."""
+        middle = torch.full((len(origins),), 0.5, device=origins.device)
+        return rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, middle, sampling)
+
     @torch.no_grad()
     def render_rays(
         self, origins: Tensor, directions: Tensor, camera_x: Tensor, modalities: Sequence[str], geometry: bool, light: bool = False
@@ -164,8 +169,7 @@ class Field(nn.Module):
         over the surfaces met, NaN where less than half of a ray meets any; of a polarization modality ``mirrored_s0/<name>`` (R,), too; and
         ``images`` (R, 3), Stokes vectors of lamps of their mean spectrum. Of a predicted modality also ``deviation/<name>`` (R, C).
         """
-        jitter = torch.full((len(origins),), 0.5, device=origins.device)
-        hits = rendering.trace(self.surface, self.appearance, self.occupancy, origins, directions, jitter, self.sampling)
+        hits = self.trace(origins, directions, self.sampling)
         return self.shade_hits(hits, origins, directions, camera_x, modalities, geometry, light)
 
     @torch.no_grad()

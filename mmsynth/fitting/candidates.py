@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmsynth.field import kernels, rendering
+from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.measurements import Batch, Measurements, draw
@@ -42,8 +42,7 @@ class Look:
 def look(field: Field, measurements: Measurements, rays: int, sampling: kernels.Sampling, random: np.random.Generator) -> Look:
     """So many rays of each modality, as the field renders them."""
     batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random)
-    jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
-    hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+    hits = field.trace(batch.origins, batch.directions, sampling)
     return Look(batch, hits, field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mmsynth.field import kernels, rendering
+from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
 from mmsynth.fitting.candidates import look, squared_errors
@@ -39,8 +39,7 @@ class _Look:
 def _look(field: Field, measurements: Measurements, sampling: kernels.Sampling, seed: int) -> _Look:
     random = np.random.default_rng((seed, 9))
     batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, _RAYS), random)
-    jitter = torch.full((len(batch.origins),), 0.5, device=field.device)
-    hits = rendering.trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, jitter, sampling)
+    hits = field.trace(batch.origins, batch.directions, sampling)
     ray = kernels.rays_of(hits.behind, len(hits.share))
     points = batch.origins[ray] + batch.directions[ray] * hits.distance[:, None]
     normals = field.normals(points, field.slopes(points, sampling.active_surface, MIRROR_CELLS))

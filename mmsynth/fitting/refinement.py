@@ -11,7 +11,7 @@ import torch
 from pydantic import TypeAdapter
 from torch import Tensor
 
-from mmsynth.field import kernels, rendering
+from mmsynth.field import kernels
 from mmsynth.field.design import Corrections
 from mmsynth.field.field import Field
 from mmsynth.fitting import motions as poses
@@ -52,17 +52,16 @@ def ray_residuals(
         far_light: whether light from beyond the region is seen.
     """
     origins, directions = (x.detach().requires_grad_() for x in (batch.origins, batch.directions))
-    middle = torch.full((len(origins),), 0.5, device=origins.device)
     field.requires_grad_(False)  # rays alone: tables would gather gradients that the next step of the fit takes for its own
     try:
         with torch.enable_grad():
-            hits = rendering.trace(field.surface, field.appearance, field.occupancy, origins, directions, middle, sampling)
+            hits = field.trace(origins, directions, sampling)
             shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind, len(hits.share))
             outputs = field.shader(shaded.features, directions[ray], degrees[ray])
             predicted = kernels.predict(outputs, shaded.share, batch.measured, hits.behind)
             predicted = predicted + field.mirrored(hits, origins, directions, batch.measured, sampling.active_surface)
             relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.measured.level
-            mean = torch.zeros_like(middle).index_add(0, batch.measured.ray, relative) / torch.bincount(
+            mean = origins.new_zeros(len(origins)).index_add(0, batch.measured.ray, relative) / torch.bincount(
                 batch.measured.ray, minlength=len(origins)
             )
             gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other

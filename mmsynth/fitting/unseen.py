@@ -13,7 +13,7 @@ from torch.nn.functional import max_pool3d
 
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
-from mmsynth.field.rendering import beginning, trace
+from mmsynth.field.rendering import beginning
 from mmsynth.fitting.measurements import Measurements, Modality, draw
 from mmsynth.fitting.stored_frames import in_threads
 from mmsynth.sensors.camera import Camera, project, unproject
@@ -42,8 +42,7 @@ def unmet_cells(field: Field, measurements: Measurements, random: np.random.Gene
     half, last = len(states) / (2.0 * field.occupancy.extent), len(states) - 1
     for _ in range(_RAYS // _RAYS_AT_ONCE):
         batch = draw(measurements, None, dict.fromkeys(measurements, max(1, _RAYS_AT_ONCE // len(measurements))), random)
-        middle = torch.full((len(batch.origins),), 0.5, device=states.device)
-        hits = trace(field.surface, field.appearance, field.occupancy, batch.origins, batch.directions, middle, field.sampling)
+        hits = field.trace(batch.origins, batch.directions, field.sampling)
         ray = kernels.rays_of(hits.behind, len(hits.share))
         points = field.surface.grid.to_grid(batch.origins[ray] + batch.directions[ray] * hits.distance[:, None])
         cells = ((points[(hits.share > _LEAST_SHARE) & (hits.distance > 0)] + field.occupancy.extent) * half).long().clamp(0, last)
