@@ -56,7 +56,7 @@ def run_kernels() -> None:
             kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none, none, 0.05),
             kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
         )  # fmt: skip
-        kernels.learn(step)
+        kernels.learn(kernels.arrange(step))
     with torch.no_grad():
         kernels.classify(Occupancy(4).states, kernels.Cells(1.0, 1, 0, 0.1, 2.0), *surface.at(1))
         kernels.shade(weights, hits.features, directions, 0)

@@ -18,22 +18,25 @@ class ToDraw:
 
     Attributes:
         rays: how many of each modality. drawings: of the photosites that are learned from, and of those outside of masks, if there are any.
-        points: how many, random ones of all space. generator: the random numbers of these, and of what else is due in the step.
+        points: how many, random ones of all space, and near what rays meet. generator: the random numbers of these, and of what else is due
+            in the step.
     """
 
     rays: dict[str, int]
-    drawings: tuple[kernels.Drawing, ...]
-    points: int
+    drawings: Sequence[kernels.Drawing]
+    points: tuple[int, int]
     generator: torch.Generator
 
 
 @dataclass(frozen=True)
 class DrawnStep:
-    """A batch, its rays with those outside of masks after them, and points (N, 3) of all space, in the frame of the grid."""
+    """A batch, its rays with those outside of masks after them, points (N, 3) of all space, in the frame of the grid, and noise (P, 3),
+    standard normal. generator: see ``ToDraw``."""
 
     batch: Batch
     rays: kernels.Rays
     points: torch.Tensor
+    noise: torch.Tensor
     generator: torch.Generator
 
 
@@ -45,5 +48,7 @@ def drawn_step(field: Field, measurements: Measurements, asked: ToDraw, drawn: S
         origins, directions = torch.cat([origins, more.origins]), torch.cat([directions, more.directions])
         jitter = torch.cat([jitter, more.jitter])
     near, far = rendering.interval(field.surface, origins, directions)
-    points = (torch.rand(asked.points, 3, generator=asked.generator) * 2 - 1) * field.surface.grid.extent
-    return DrawnStep(batch, kernels.Rays(origins, directions, near, far, jitter), points, asked.generator)
+    anywhere, close = asked.points
+    points = (torch.rand(anywhere, 3, generator=asked.generator) * 2 - 1) * field.surface.grid.extent
+    noise = torch.randn(close, 3, generator=asked.generator)
+    return DrawnStep(batch, kernels.Rays(origins, directions, near, far, jitter), points, noise, asked.generator)

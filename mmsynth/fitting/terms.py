@@ -47,13 +47,13 @@ def eikonal_points(recipe: Recipe, shines: bool) -> tuple[int, int]:
 
 
 def eikonal(
-    field: Field, sampling: kernels.Sampling, recipe: Recipe, progress: float, points: torch.Tensor, generator: torch.Generator
+    field: Field, sampling: kernels.Sampling, recipe: Recipe, progress: float, points: torch.Tensor, noise: torch.Tensor
 ) -> kernels.Eikonal:
-    """Where the distance is pulled towards a true one: in all space (``points``, a quarter of all), and within the soft surface, or at all
-    surfaces that rays meet where these shine, whose normals are known."""
+    """Where the distance is pulled towards a true one: in all space (``points``, a quarter of all), and within the soft surface (by
+    ``noise``, standard normal), or at all surfaces that rays meet where these shine, whose normals are known."""
     grid = field.surface.grid
     _, near = eikonal_points(recipe, field.shines)
-    noise = torch.randn(near, 3, generator=generator) * (3.0 / sampling.sharpness)
+    noise = noise[:near] * (3.0 / sampling.sharpness)
     cell = grid.cell(sampling.active_surface)
     shallow = shallow_factor(is_early(progress, recipe), recipe)
     return kernels.Eikonal(points.to(field.device), noise.to(field.device), recipe.loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow)

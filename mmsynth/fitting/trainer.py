@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -98,10 +97,10 @@ class Trainer:
             given = self.field, self.measurements, self.importance, self.optimiser, self.log_gain, self.needs, recipe, seed
             self.on_device = DeviceStep(*given)
             self.state.rays = max(self.state.rays, self.on_device.first_rays)
-        self.prepared: tuple[Any, ...] = ()  # of the last step on the device, what was then
+        self.settled: tuple[Any, ...] = ()  # at the last step
         self.coming: DrawnStep | None = None
-        self.points, _ = eikonal_points(recipe, shines=False)  # of all space, whether it shines or not
-        self.random_ahead = 0, self._random(0)  # of a step, made beside the kernels of one before
+        self.arranged: tuple[ToDraw, kernels.Arranged] | None = None  # the next step, if nothing has changed since that it follows from
+        self.points = eikonal_points(recipe, shines=False)  # those near what rays meet are left out where it shines
         self.parts: dict[str, Any] = {
             "field": self.field,
             "optimiser": self.optimiser,
@@ -113,8 +112,11 @@ class Trainer:
     @property
     def progress(self) -> float:
         """Share of the fit that is done, in [0, 1]."""
+        return self._progress_at(self.state.step)
+
+    def _progress_at(self, step: int) -> float:
         if self.steps is not None:
-            return min(1.0, self.state.step / self.steps)
+            return min(1.0, step / self.steps)
         return min(1.0, self.state.elapsed / self.budget)  # type: ignore[operator]
 
     @property
@@ -136,8 +138,8 @@ class Trainer:
 
     def run_step(self) -> None:
         """One optimiser step."""
-        state = self.state
-        sampling = sampling_at(self.progress, self.recipe, self.needs)
+        state, done = self.state, self.progress
+        sampling = sampling_at(done, self.recipe, self.needs)
         if self.on_device is not None:
             self._prepare(sampling, self._random(state.step)[1])
             self._step_on(self.on_device, sampling)
@@ -147,16 +149,17 @@ class Trainer:
             asked = self._to_draw(state.step, state.rays)
             drawn = drawn_step(self.field, self.measurements, asked, [kernels.draw(*drawing) for drawing in asked.drawings])
         self._prepare(sampling, drawn.generator)
-        asked = self._to_draw(state.step + 1, state.rays_after)
+        asked, arranged = self.arranged or self._arrange(drawn, state.step)
         rays, state.rays, errors = state.rays, state.rays_after, dict[str, float]()
 
         def meanwhile(learned: kernels.Learned) -> None:
             self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
-            self.random_ahead = state.step + 2, self._random(state.step + 2)
             if math.isfinite(learned.loss):
                 errors.update(self._errors(drawn.batch, learned.squared))
+            state.rays_after = self._adapted(rays, samples_of_step(done, self.recipe), int(learned.samples), _MOST_RAYS)
+            self.arranged = self._arrange(self.coming, state.step + 1)
 
-        learned = self._learn(drawn, sampling, asked.drawings, lambda: self._update(sampling), meanwhile)
+        learned = kernels.learn(arranged, lambda: self._update(sampling), meanwhile)
         wrong = self._wrong(learned)
         if wrong is not None:
             self._skip(wrong)
@@ -164,13 +167,12 @@ class Trainer:
         self.optimiser.count += 1
         self._average()
         keep = 0.98 if state.step else 0.0
-        value, before, samples = float(learned.loss), state.mean_loss, int(learned.samples)
+        value, before = float(learned.loss), state.mean_loss
         state.mean_loss = value if math.isnan(before) else keep * before + (1 - keep) * value  # nan: all were skipped
         for name, error in errors.items():
             state.mean_error[name] = keep * state.mean_error.get(name, error) + (1 - keep) * error
         state.rays_total += len(drawn.batch.origins)
-        state.samples_total += samples
-        state.rays_after = self._adapted(rays, samples_of_step(self.progress, self.recipe), samples, _MOST_RAYS)
+        state.samples_total += int(learned.samples)
         state.step += 1
 
     def _adapted(self, rays: float, wanted: float, samples: float, most: int) -> int:
@@ -185,10 +187,6 @@ class Trainer:
     def _step_on(self, step: DeviceStep, sampling: kernels.Sampling) -> None:
         """A step that the device takes while the host goes on; what earlier ones told is taken in."""
         state, done = self.state, self.progress
-        prepared = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided))
-        if prepared != self.prepared:
-            step.renew()
-            self.prepared = prepared
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
         step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
@@ -223,6 +221,7 @@ class Trainer:
                 state.reopened += 1
         if state.step % _RENEW_EVERY == 0:
             self.importance.renew()
+            self.arranged = None
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
             self._resize_tables(state.tables, generator)
@@ -246,6 +245,11 @@ class Trainer:
                 self._see_directions(state.decided)
         if self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
+        settled = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided)), *field.view_dependence.values()
+        if settled != self.settled:
+            self.settled, self.arranged = settled, None
+            if self.on_device is not None:
+                self.on_device.renew()
 
     def _random(self, step: int) -> tuple[np.random.Generator, torch.Generator]:
         """The random numbers of a step."""
@@ -254,8 +258,7 @@ class Trainer:
 
     def _to_draw(self, step: int, rays: int) -> ToDraw:
         """The rays of a step."""
-        known, numbers = self.random_ahead
-        random, generator = numbers if known == step else self._random(step)
+        random, generator = self._random(step)
         total = sum(self.needs.share.values())
         counts = {n: max(1, int(rays * share / total)) for n, share in self.needs.share.items()}
         of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, self.importance.selection)
@@ -289,15 +292,14 @@ class Trainer:
         if length > 0 and done >= 1.0 - 4.0 * length and self.state.step % _AVERAGE_EVERY == 0:
             self.average.update(length * self.state.step / max(done, 1e-9) / _AVERAGE_EVERY)
 
-    def _learn(
-        self,
-        drawn: DrawnStep,
-        sampling: kernels.Sampling,
-        ahead: Sequence[kernels.Drawing] = (),
-        update: Callable[[], Sequence[kernels.AdamPart]] | None = None,
-        meanwhile: Callable[[kernels.Learned], None] | None = None,
-    ) -> kernels.Learned:
-        """The loss of a batch; gradients are added to ``grad`` of all that is learned. See ``kernels.learn``."""
+    def _arrange(self, drawn: DrawnStep, step: int) -> tuple[ToDraw, kernels.Arranged]:
+        """A step, and what is drawn beside it: the rays of the one after it."""
+        asked, done = self._to_draw(step + 1, self.state.rays_after), self._progress_at(step)
+        of_step = self._of_step(drawn, sampling_at(done, self.recipe, self.needs), done)
+        return asked, kernels.arrange(of_step, asked.drawings)
+
+    def _of_step(self, drawn: DrawnStep, sampling: kernels.Sampling, progress: float) -> kernels.Step:
+        """What is learned from, and how."""
         field, batch, rays = self.field, drawn.batch, drawn.rays
         # a few frames would bend geometry, appearance and trunk to themselves: sparse modalities teach their own head alone
         trains = batch.per_ray({n: n not in self.needs.sparse for n in batch.parts})
@@ -310,14 +312,13 @@ class Trainer:
         none = rays.origins.new_empty(0)
         far_light = field.far_light if field.far_light is not None and self.state.decided is not None else none
         log_gain = self.log_gain if self._has_gains else none
-        step = kernels.Step(
+        return kernels.Step(
             *field.surface.at(sampling.active_surface), field.appearance.at(sampling.active_radiance), field.occupancy.states,
             field.shader.weights(), light, far_light, rays, kernels.View(degrees, trains), batch.measured,
             kernels.Gains(log_gain, batch.frame),
-            opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, self.progress),
-            eikonal(field, sampling, self.recipe, self.progress, drawn.points, drawn.generator), sampling,
+            opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, progress),
+            eikonal(field, sampling, self.recipe, progress, drawn.points, drawn.noise), sampling,
         )  # fmt: skip
-        return kernels.learn(step, ahead, update, meanwhile)
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:
         """Mean squared error of each modality; what residuals say of where to look is kept."""
@@ -415,7 +416,7 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
-        self.coming = None
+        self.coming = self.arranged = None
         if self.on_device is not None:
             self.on_device.resume()
         if self.state.decided is not None:

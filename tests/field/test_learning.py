@@ -97,7 +97,7 @@ def _told(step: dict[str, Any], dtype: torch.dtype, active: int = 3) -> tuple[ke
 def _run(step: dict[str, Any], dtype: torch.dtype, *ahead: Sequence[kernels.Drawing]) -> tuple[kernels.Learned, dict[str, Tensor]]:
     """What was learned, and all gradients by name."""
     told, parameters = _told(step, dtype)
-    found = (kernels.learn if dtype == torch.float32 or ahead else learning.learn)(told, *ahead)
+    found = kernels.learn(kernels.arrange(told, *ahead)) if dtype == torch.float32 or ahead else learning.learn(told)
     return found, {n: p.grad.clone() for n, p in parameters.items() if p.grad is not None and p.numel()}
 
 
@@ -173,14 +173,16 @@ def _with_update(step: dict[str, Any], dtype: torch.dtype, active: int = 3) -> t
     """What was learned, parameters, gradients and moments after it, and what was told meanwhile."""
     told, parameters = _told(step, dtype, active)
     parts, heard = _parts(parameters), list[Any]()
-    found = kernels.learn(told, (), lambda: parts, lambda learned: heard.append((learned.loss.clone(), learned.squared.clone())))
+    found = kernels.learn(
+        kernels.arrange(told), lambda: parts, lambda learned: heard.append((learned.loss.clone(), learned.squared.clone()))
+    )
     return found, [x.detach().clone() for part in parts for x in part[:4]], heard
 
 
 def _check_update(case: str, active: int) -> None:
     """The same to the bit as Adam by itself of whole tables after it."""
     told, parameters = _told(_step(*CASES[case]), torch.float32, active)
-    alone, parts = kernels.learn(told), _parts(parameters)
+    alone, parts = kernels.learn(kernels.arrange(told)), _parts(parameters)
     moved = [bool(part.gradient.any()) for part in parts]
     with torch.no_grad():
         for part in parts:
@@ -227,8 +229,8 @@ def test_what_fails_beside_the_kernels_is_raised(threads: int, monkeypatch: pyte
 
     for arguments in ((fails, None), (None, fails)):
         with pytest.raises(LookupError, match="beside"):
-            kernels.learn(told, (), *arguments)
-    assert torch.isfinite(kernels.learn(told).loss)
+            kernels.learn(kernels.arrange(told), *arguments)
+    assert torch.isfinite(kernels.learn(kernels.arrange(told)).loss)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -192,6 +192,28 @@ def test_a_fit_goes_on_anywhere_with_the_rays_that_were_drawn_ahead(scene: Scene
         assert all(torch.equal(value, expected[name]) for name, value in _tensors(other.field).items()), step
 
 
+def test_what_is_arranged_beside_the_step_before_is_what_the_step_needs(scene: Scene) -> None:
+    """Whatever was decided in between: where rays go, view dependence, rows of tables, lamps, exposure, poses."""
+    changes = {
+        "radiance.light": "auto", "schedule.light_until": 0.5, "schedule.view_dependence_from": 0.2, "radiance.view_dependence": 3,
+        "schedule.tables_at": 0.15, "surface.max_rows_log2": 14, "radiance.max_rows_log2": 15, "surface.rays_per_row": 0.002,
+        "radiance.rays_per_row": 0.001, "radiance.cells_per_pixel": 30.0, "surface.cells_per_row": 2.0, "radiance.cells_per_row": 2.0,
+        "schedule.decide_at": 0.7, "radiance.exposure": "on", "poses.views": "on", "poses.start_at": 0.3, "sampling.evenly": 0.2,
+    }  # fmt: skip
+    beforehand, when_due = (_trainer(scene, 100, **changes) for _ in range(2))
+    arranged = 0
+    for _ in range(100):
+        beforehand.run_step()
+        arranged += beforehand.arranged is not None
+        when_due.run_step()
+        when_due.arranged = None
+    assert arranged == 100 and beforehand.choices["tables"].changed and len(beforehand.choices) > len(beforehand.needs.choices) + 3
+    theirs = when_due.field.state_dict()
+    for name, value in beforehand.field.state_dict().items():
+        assert torch.equal(value, theirs[name]), name
+    assert beforehand.state == when_due.state
+
+
 def test_a_fit_that_is_looked_at_comes_to_the_same_field(scene: Scene, tmp_path: Path) -> None:
     frame = scene.frames_of("rgb")[0]
     lit = []
@@ -430,8 +452,9 @@ def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     trainer.recipe = _recipe(**changes)
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
     generator = torch.Generator().manual_seed(0)
-    drawn = DrawnStep(batch, _rays(trainer, batch), torch.rand(256, 3, generator=generator) * 2 - 1, generator)
-    return float(trainer._learn(drawn, sampling).loss)
+    points, noise = torch.rand(256, 3, generator=generator) * 2 - 1, torch.randn(768, 3, generator=generator)
+    drawn = DrawnStep(batch, _rays(trainer, batch), points, noise, generator)
+    return float(kernels.learn(kernels.arrange(trainer._of_step(drawn, sampling, trainer.progress))).loss)
 
 
 def _rays(trainer: Trainer, batch: Any) -> kernels.Rays:
@@ -538,7 +561,7 @@ def test_eikonal_points_lie_at_the_surface_and_everywhere(scene: Scene, backgrou
     sampling = sampling_at(0.0, trainer.recipe, trainer.needs)
     to_draw = trainer._to_draw(0, 64)
     drawn = drawn_step(trainer.field, trainer.measurements, to_draw, [kernels.draw(*drawing) for drawing in to_draw.drawings])
-    asked = eikonal(trainer.field, sampling, trainer.recipe, 0.0, drawn.points, drawn.generator)
+    asked = eikonal(trainer.field, sampling, trainer.recipe, 0.0, drawn.points, drawn.noise)
     grid = trainer.field.surface.grid
     assert grid.extent == (2.0 if background == "on" else 1.0)
     assert asked.points.shape == (32, 3) and asked.noise.shape == (96, 3)

@@ -24,6 +24,7 @@ from mmsynth.field.kernels.mirroring import Reflection, Surroundings, surround
 from mmsynth.field.kernels.parameters import (
     AdamPart,
     AdamStep,
+    Arranged,
     Cameras,
     Cells,
     Drawing,
@@ -59,6 +60,7 @@ __all__ = [
     "SOLID",
     "AdamPart",
     "AdamStep",
+    "Arranged",
     "Cameras",
     "Cells",
     "Drawing",
@@ -87,6 +89,7 @@ __all__ = [
     "Surroundings",
     "View",
     "adam",
+    "arrange",
     "classify",
     "compare",
     "contract",
@@ -198,22 +201,30 @@ def reflect(position: Tensor, mirrors: Mirrors) -> Reflection:
     return _backend(mirrors.share).reflect(position, mirrors)
 
 
+def arrange(step: Step, ahead: Sequence[Drawing] = ()) -> Arranged:
+    """What ``learn`` takes. It may be made while the step before is learned: what is in the tensors may change in place until then.
+
+    Args:
+        ahead: what is drawn beside the step, two drawings at the most.
+    """
+    return cpu.arrange(step, ahead) if _backend(step.rays.origins) is cpu else Arranged(step, tuple(ahead))
+
+
 def learn(
-    step: Step,
-    ahead: Sequence[Drawing] = (),
+    arranged: Arranged,
     update: Callable[[], Sequence[AdamPart]] | None = None,
     meanwhile: Callable[[Learned], None] | None = None,
 ) -> Learned:
     """A step's loss, its gradients, added to ``grad`` of what is learned, and a step of Adam. Python has its time beside the kernels.
 
     Args:
-        ahead: what is drawn beside it, two drawings at the most.
         update: gives what moves by its gradient, which is cleared; where the loss or a gradient is not finite nothing moves, and they stay.
         meanwhile: called with what was learned, before or while that moves: the sum of all gradients may not be known then.
     """
+    step, ahead, _ = arranged
     backend = _backend(step.rays.origins)
     if backend is cpu:
-        return cpu.learn(step, ahead, update, meanwhile)
+        return cpu.learn(arranged, update, meanwhile)
     learned: Learned = learning.learn(step) if backend is reference else backend.learn(step)
     learned = learned._replace(drawn=tuple(draw(*drawing) for drawing in ahead))
     if meanwhile is not None:

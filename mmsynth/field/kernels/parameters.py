@@ -8,7 +8,7 @@ Of what is drawn from: N modalities, F frames, C cameras, T tiles of frames, A a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -281,6 +281,14 @@ class Step(NamedTuple):
     opacities: Opacities
     eikonal: Eikonal
     sampling: Sampling
+
+
+class Arranged(NamedTuple):
+    """A step, what is drawn beside it, and what the back end made of both, which holds as long as their tensors do."""
+
+    step: Step
+    ahead: tuple[Drawing, ...]
+    made: Any = None
 
 
 class Learned(NamedTuple):

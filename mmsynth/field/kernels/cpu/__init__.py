@@ -12,12 +12,12 @@ from mmsynth.field.kernels.cpu.caching import kept_by_version
 with kept_by_version(Path(__file__).parent):
     from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled, remove_old_kernels
     from mmsynth.field.kernels.cpu.drawing import draw, odds
-    from mmsynth.field.kernels.cpu.operations import classify, compare, learn, mirror, reflect, shade, surface_value, trace
+    from mmsynth.field.kernels.cpu.operations import arrange, classify, compare, learn, mirror, reflect, shade, surface_value, trace
     from mmsynth.field.kernels.cpu.optimiser import adam
 
 from mmsynth.field.kernels.reference import hash_encode, march, section_weights
 
 __all__ = [
-    "KERNELS", "adam", "classify", "compare", "draw", "hash_encode", "is_compiled", "learn", "march", "mirror", "odds",
+    "KERNELS", "adam", "arrange", "classify", "compare", "draw", "hash_encode", "is_compiled", "learn", "march", "mirror", "odds",
     "reflect", "remove_old_kernels", "section_weights", "shade", "surface_value", "trace",
 ]  # fmt: skip

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -122,7 +123,7 @@ def drawing_tasks(drawing):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_chunk(chunk, drawing):  # type: ignore[no-untyped-def]
-    """A task: some of the rays. drawing: see ``to_draw``."""
+    """A task: some of the rays. drawing: the arrays of a ``ToFill``."""
     frames, cameras = Frames(*drawing[:_CAMERAS]), Cameras(*drawing[_CAMERAS:_MODALITIES])
     modalities, selection = Modalities(*drawing[_MODALITIES:_SELECTION]), Selection(*drawing[_SELECTION:_RAYS])
     rays, key = drawing[_RAYS], drawing[_KEY]
@@ -235,8 +236,15 @@ def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignor
             before = here
 
 
-def to_draw(drawing: Drawing) -> tuple[tuple[np.ndarray, ...], Drawn]:
-    """What kernels take, all arrays in one tuple (numba's parallel kernels take none of tuples), and what they fill."""
+class ToFill(NamedTuple):
+    """A drawing as kernels take it, all arrays in one tuple (numba's parallel kernels take none of tuples), and what they fill."""
+
+    arrays: tuple[np.ndarray, ...]
+    drawn: Drawn
+
+
+def to_fill(drawing: Drawing) -> ToFill:
+    """With room for what is drawn."""
     *tables, rays, key = drawing
     modalities = drawing.modalities
     values = modalities.values.tolist()
@@ -248,7 +256,7 @@ def to_draw(drawing: Drawing) -> tuple[tuple[np.ndarray, ...], Drawn]:
         single(numbers), whole(numbers), whole(numbers), single(polarized, 3), single(numbers), single(numbers), single(numbers)
     )
     told, filled = (x.numpy() for table in tables for x in table), (x.numpy() for x in (*drawn, *measured))
-    return (*told, np.array(rays, np.int64), np.array(key, np.int64), *filled), Drawn(*drawn, measured)
+    return ToFill((*told, np.array(rays, np.int64), np.array(key, np.int64), *filled), Drawn(*drawn, measured))
 
 
 @functools.cache
@@ -259,14 +267,14 @@ def nothing_to_draw() -> tuple[np.ndarray, ...]:
     frames = Frames(long, whole, whole, whole, whole, single.view(0, 3, 3), single.view(0, 3), *stored)
     cameras, selection = Cameras(whole, whole, long, whole, whole, single.view(0, 3)), Selection(long, single, whole, long, whole)
     modalities = Modalities(*(whole,) * 10, single, single, single, whole, single.view(0, 2))  # type: ignore[call-arg]
-    return to_draw(Drawing(frames, cameras, modalities, selection, [], (0, 0)))[0]
+    return to_fill(Drawing(frames, cameras, modalities, selection, [], (0, 0))).arrays
 
 
 def draw(
     frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
 ) -> Drawn:
     """See ``drawing.draw``; float32."""
-    arrays, drawn = to_draw(Drawing(frames, cameras, modalities, selection, rays, key))
+    arrays, drawn = to_fill(Drawing(frames, cameras, modalities, selection, rays, key))
     draw_rays(arrays)
     return drawn
 

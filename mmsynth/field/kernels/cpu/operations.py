@@ -19,7 +19,7 @@ from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
 from mmsynth.field.kernels.cpu.blocks import surface_layers
-from mmsynth.field.kernels.cpu.drawing import nothing_to_draw, to_draw
+from mmsynth.field.kernels.cpu.drawing import ToFill, nothing_to_draw, to_fill
 from mmsynth.field.kernels.cpu.learning import WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.matrices import padded
@@ -42,6 +42,7 @@ from mmsynth.field.kernels.learning import gradient_of, no_light
 from mmsynth.field.kernels.mirroring import Reflection
 from mmsynth.field.kernels.parameters import (
     AdamPart,
+    Arranged,
     Cells,
     Drawing,
     GridTable,
@@ -325,70 +326,84 @@ class _Mirror(torch.autograd.Function):
         return None, None, None, *(x.sum(0) for x in of_lamps), *of_rows
 
 
+class _Made(NamedTuple):
+    """Of ``Arranged``: the step with arrays in the place of tensors, and what is drawn beside it."""
+
+    step: Any
+    ahead: tuple[ToFill, ...]
+
+
+@torch.no_grad()
+def arrange(step: Step, ahead: Sequence[Drawing] = ()) -> Arranged:
+    """See ``kernels.arrange``."""
+    arrays: list[Any] = [_arrays(x) if isinstance(x, tuple) else _compiled(x) for x in step]
+    of_step = Step(*arrays)._replace(sampling=_in_double(step.sampling))
+    return Arranged(step, tuple(ahead), _Made(of_step, tuple(to_fill(drawing) for drawing in ahead)))
+
+
 @torch.no_grad()
 def learn(
-    step: Step,
-    ahead: Sequence[Drawing] = (),
+    arranged: Arranged,
     update: Callable[[], Sequence[AdamPart]] | None = None,
     meanwhile: Callable[[Learned], None] | None = None,
 ) -> Learned:
     """See ``kernels.learn`` and ``learning.learn``; float32, ``measured.ray`` never decreasing."""
-    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
+    step, (made, ahead) = arranged.step, arranged.made
+    table, network, look, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = made
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), get_num_threads()
     tasks = chunks + -(-points // slopes.POINTS)
-    units, levels = len(network.hidden), len(grid.resolutions)
-    features, hidden = FEATURES * len(appearance.resolutions), len(light.first)
-    used = light.used.numpy()
+    units, levels = len(network.hidden), len(table.resolutions)
+    features, hidden, used = FEATURES * len(look.resolutions), len(light.first), light.used
     parts = len(light.second_bias) - len(light.position)
     columns = np.concatenate([np.arange(parts), parts + used])
-    lamps = Lamps(_array(light.position)[used], np.exp(_array(light.log_spectrum)[used]))
-    shining: Any = _arrays(light)
-    shining = shining._replace(second=shining.second[columns], second_bias=shining.second_bias[columns])
+    lamps = Lamps(light.position[used], np.exp(light.log_spectrum[used]))
+    shining = two_layers(light.first, light.first_bias, light.second[columns], light.second_bias[columns])
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
-        of_frames = np.exp(_array(gains.log_gain) - np.mean(_array(gains.log_gain), dtype=np.float64)).astype(np.float32)
-        gain = of_frames[gains.frame.numpy()]
-    store, taps = ray_store(threads, units, levels, len(appearance.resolutions)), tap_store(tasks, units, levels)
-    kept = table_store(chunks, units, levels, len(appearance.resolutions))
+        of_frames = np.exp(gains.log_gain - np.mean(gains.log_gain, dtype=np.float64)).astype(np.float32)
+        gain = of_frames[gains.frame]
+    store, taps = ray_store(threads, units, levels, len(look.resolutions)), tap_store(tasks, units, levels)
+    kept = table_store(chunks, units, levels, len(look.resolutions))
     weights = shading_store(max(chunks, threads), shader)
     scratch = chunk_scratch(threads, units, features, len(columns), hidden)
     out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
     squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
     g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
-    to_fill = [to_draw(drawing) for drawing in ahead]
-    first, second = (*(arrays for arrays, _ in to_fill), nothing_to_draw(), nothing_to_draw())[:2]
-    table, look = _arrays(grid), _arrays(appearance)
+    first, second = (*(x.arrays for x in ahead), nothing_to_draw(), nothing_to_draw())[:2]
     to_learn = (
-        np.zeros(2, np.int64), _arrays(rays), _array(states), _in_double(sampling), table, surface_layers(_arrays(network)), look,
-        *_shader_layers(_arrays(shader)), two_layers(*shining[:4]), lamps, _array(far_light), _arrays(view), _arrays(measured), gain,
-        _arrays(opacities), _arrays(eikonal), first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays, scratch.arrays,
-        out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
+        np.zeros(2, np.int64), rays, states, sampling, table, surface_layers(network), look, *_shader_layers(shader), shining, lamps,
+        far_light, view, measured, gain, opacities, eikonal, first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays,
+        scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
-    sums, done = np.zeros(2), np.zeros(1 + grid.active + appearance.active, np.int64)
+    sums, done = np.zeros(2), np.zeros(1 + table.active + look.active, np.int64)
 
     def to_finish() -> tuple[Any, ...]:
-        learned = (*network[:2], *shader, *(light[:6] if len(used) else no_light("cpu")[:6]), far_light)
+        learned = (*step.network[:2], *step.shader, *(step.light[:6] if len(used) else no_light("cpu")[:6]), step.far_light)
         gradients = WeightGradients(*(gradient_of(x).numpy() for x in learned))
         of_levels: dict[int, tuple[Any, int]] = {
-            grid.table.data_ptr(): (table.offsets[: grid.active + 1], 1),
-            appearance.table.data_ptr(): (look.offsets[: appearance.active + 1], 1 + grid.active),
+            step.grid.table.data_ptr(): (table.offsets[: table.active + 1], 1),
+            step.appearance.table.data_ptr(): (look.offsets[: look.active + 1], 1 + table.active),
         }
         return (
             np.zeros(1, np.int64), done, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used,
-            lamps.spectrum, gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy(), gradients, sums,
+            lamps.spectrum, gradient_of(step.grid.table).numpy(), gradient_of(step.appearance.table).numpy(), gradients, sums,
             *places_and_numbers(update() if update is not None else (), of_levels),
         )  # fmt: skip
 
     finish = take_beside(to_finish, threads, learning.learn_rays, to_learn)
     loss = sums[0] = out.arrays.loss[:tasks].sum()
     if len(gain):
-        by_frame = np.bincount(gains.frame.numpy(), g_gain, len(of_frames)) * of_frames
+        by_frame = np.bincount(gains.frame, g_gain, len(of_frames)) * of_frames
         of_gains = by_frame - by_frame.mean()
-        gradient_of(gains.log_gain).numpy()[...] += of_gains.astype(np.float32)
+        gradient_of(step.gains.log_gain).numpy()[...] += of_gains.astype(np.float32)
         sums[1] = of_gains.sum()
-    found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
-    result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(drawn for _, drawn in to_fill))
-    tell = meanwhile or (lambda _: None)
-    take_beside(lambda: tell(result), threads, learning.finish, finish)
-    return result
+
+    def to_tell() -> Learned:
+        found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
+        result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(x.drawn for x in ahead))
+        if meanwhile is not None:
+            meanwhile(result)
+        return result
+
+    return take_beside(to_tell, threads, learning.finish, finish)
