@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import learning
-from mmsynth.field.kernels.cpu import operations, tasks
+from mmsynth.field.kernels.cpu import steps, tasks
 from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
@@ -199,7 +199,7 @@ def _check_update(case: str, active: int) -> None:
 @pytest.mark.parametrize("active", [1, 3])
 @pytest.mark.parametrize("case", ["all", "plain"])
 def test_a_step_of_adam_comes_with_it(case: str, active: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operations, "get_num_threads", lambda: threads)
+    monkeypatch.setattr(steps, "get_num_threads", lambda: threads)
     _check_update(case, active)
 
 
@@ -221,7 +221,7 @@ def test_nothing_moves_by_what_is_not_finite(what: str, dtype: torch.dtype, monk
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
 def test_what_fails_beside_the_kernels_is_raised(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operations, "get_num_threads", lambda: threads)
+    monkeypatch.setattr(steps, "get_num_threads", lambda: threads)
     told, _ = _told(_step(*CASES["plain"]), torch.float32)
 
     def fails(*_: Any) -> Any:

@@ -1,8 +1,8 @@
 """The operations for float32 on the CPU, fused and compiled by numba; what is not fused is the reference's.
 
-Begin with ``operations``, the autograd functions; the kernels are in ``blocks`` (what all are made of), ``surface``, ``marching`` and
-``tracing_gradients``, ``shading``, ``mirroring``, ``drawing``, ``optimiser`` and, all together in a step of a fit, ``learning``; ``tasks``
-is how threads share them.
+Begin with ``operations``, the autograd functions, and ``steps``, a step of a fit; the kernels are in ``blocks`` (what all are made of),
+``surface``, ``marching`` and ``tracing_gradients``, ``shading``, ``mirroring``, ``drawing``, ``optimiser`` and, all together in a step of
+a fit, ``learning``; ``tasks`` is how threads share them.
 """
 
 from pathlib import Path
@@ -12,8 +12,9 @@ from mmsynth.field.kernels.cpu.caching import kept_by_version
 with kept_by_version(Path(__file__).parent):
     from mmsynth.field.kernels.cpu.compiled import KERNELS, is_compiled, remove_old_kernels
     from mmsynth.field.kernels.cpu.drawing import draw, odds
-    from mmsynth.field.kernels.cpu.operations import arrange, classify, compare, learn, mirror, reflect, shade, surface_value, trace
+    from mmsynth.field.kernels.cpu.operations import classify, compare, mirror, reflect, shade, surface_value, trace
     from mmsynth.field.kernels.cpu.optimiser import adam
+    from mmsynth.field.kernels.cpu.steps import arrange, learn
 
 from mmsynth.field.kernels.reference import hash_encode, march, section_weights
 

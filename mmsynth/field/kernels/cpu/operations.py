@@ -7,8 +7,7 @@ follows autograd's rules.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,49 +16,34 @@ from torch import Tensor
 
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES
-from mmsynth.field.kernels.cpu import learning, marching, mirroring, shading, slopes, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import marching, mirroring, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu.arrays import as_array, as_arrays, in_double, shader_layers
 from mmsynth.field.kernels.cpu.blocks import surface_layers
-from mmsynth.field.kernels.cpu.drawing import ToFill, nothing_to_draw, to_fill
-from mmsynth.field.kernels.cpu.learning import WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.matrices import padded
-from mmsynth.field.kernels.cpu.optimiser import places_and_numbers
-from mmsynth.field.kernels.cpu.shading import Layers, two_layers
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
     SurfaceStore,
-    chunk_scratch,
-    light_out,
     ray_store,
     shading_store,
     surface_store,
-    table_store,
-    tap_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
-from mmsynth.field.kernels.cpu.tasks import take_beside
-from mmsynth.field.kernels.learning import gradient_of, no_light
+from mmsynth.field.kernels.learning import gradient_of
 from mmsynth.field.kernels.mirroring import Reflection
 from mmsynth.field.kernels.parameters import (
-    AdamPart,
-    Arranged,
     Cells,
-    Drawing,
     GridTable,
     Hits,
     Lamps,
-    Learned,
     Measured,
     Mirrors,
     Rays,
     Sampling,
     ShadedRays,
     ShaderWeights,
-    Step,
     SurfaceNetwork,
 )
-
-P = TypeVar("P", bound=tuple[Any, ...])
 
 
 class TraceOutputs(NamedTuple):
@@ -72,31 +56,6 @@ class TraceOutputs(NamedTuple):
     shown: np.ndarray
     depth: np.ndarray
     samples: np.ndarray
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return (tensor if tensor.is_contiguous() else tensor.contiguous()).numpy(force=True)
-
-
-def _arrays(parameters: P) -> P:
-    """Tensors as arrays, numbers in single precision: the types that the kernels are compiled for."""
-    return type(parameters)(*map(_compiled, parameters))
-
-
-def _compiled(x: Any) -> Any:
-    return _array(x) if isinstance(x, Tensor) else np.float32(x) if isinstance(x, float) else x
-
-
-def _in_double(sampling: Sampling) -> Sampling:
-    """Numbers in double precision, even those given as integers."""
-    whole = {"active_surface", "active_radiance"}
-    values: dict[str, Any] = {name: value if name in whole else float(value) for name, value in sampling._asdict().items()}
-    return Sampling(**values)
-
-
-def _shader_layers(weights: Any) -> tuple[Layers, np.ndarray, np.ndarray]:
-    """Hidden layers, heads and their biases of ``ShaderWeights`` of arrays."""
-    return two_layers(*weights[:4]), weights.heads, weights.heads_bias
 
 
 def _kept(*tensors: Tensor) -> bool:
@@ -124,7 +83,7 @@ class _Value(torch.autograd.Function):
     ) -> Tensor:
         store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), len(hidden), len(grid.resolutions))
         out = torch.empty(len(positions))
-        surface.surface_forward(_array(positions), _arrays(grid), surface_layers(_arrays(network)), keep, store.arrays, out.numpy())
+        surface.surface_forward(as_array(positions), as_arrays(grid), surface_layers(as_arrays(network)), keep, store.arrays, out.numpy())
         if keep:
             ctx.store, ctx.parameters = store, (grid, network)
             ctx.save_for_backward(hidden, output)
@@ -135,7 +94,7 @@ class _Value(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         hidden, output = ctx.saved_tensors
         (grid, network), arrays, count = ctx.parameters, ctx.store.arrays, len(gradient)
-        g, table, weights = _array(gradient), _arrays(grid), surface_layers(_arrays(network._replace(hidden=hidden, output=output)))
+        g, table, weights = as_array(gradient), as_arrays(grid), surface_layers(as_arrays(network._replace(hidden=hidden, output=output)))
         surface.surface_backward(g, grid.active, weights, arrays)
         positions = None
         if ctx.needs_input_grad[1]:
@@ -153,15 +112,15 @@ def classify(states: Tensor, cells: Cells, grid: GridTable, network: SurfaceNetw
     store = surface_store(threads, len(network.hidden), len(grid.resolutions))
     centre = ((torch.arange(side) + 0.5) * (2.0 / side) - 1.0) * cells.extent
     surface.classify(
-        threads, np.zeros(2, np.int64), states.view(-1).numpy(), centre.numpy(), _arrays(cells), _arrays(grid),
-        surface_layers(_arrays(network)), store.arrays,
+        threads, np.zeros(2, np.int64), states.view(-1).numpy(), centre.numpy(), as_arrays(cells), as_arrays(grid),
+        surface_layers(as_arrays(network)), store.arrays,
     )  # fmt: skip
 
 
 def trace(grid: GridTable, network: SurfaceNetwork, appearance: GridTable, states: Tensor, rays: Rays, sampling: Sampling) -> Hits:
     """See ``reference.trace``; float32. Differentiable in origins, directions, weights, and, in place, the tables."""
     keep = _kept(rays.origins, rays.directions, network.hidden)
-    parameters = grid, network, appearance, states, rays, _in_double(sampling)
+    parameters = grid, network, appearance, states, rays, in_double(sampling)
     features, weight, distance, behind, depth, samples = _Trace.apply(
         keep, rays.origins, rays.directions, network.hidden, network.output, parameters
     )
@@ -185,7 +144,7 @@ class _Trace(torch.autograd.Function):
         weight, distance, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
         marching.trace_forward(
-            _arrays(rays), _array(states), sampling, _arrays(grid), surface_layers(_arrays(network)), _arrays(appearance), keep,
+            as_arrays(rays), as_array(states), sampling, as_arrays(grid), surface_layers(as_arrays(network)), as_arrays(appearance), keep,
             store.arrays,
             TraceOutputs(*(x.numpy() for x in (features, weight, distance, shown, depth, samples))),
         )  # fmt: skip
@@ -204,16 +163,16 @@ class _Trace(torch.autograd.Function):
     def backward(ctx: Any, g_features: Tensor, g_weight: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         hidden, output, origins, directions, features, shown, behind = ctx.saved_tensors
         (grid, network, appearance, sharpness), arrays, count = ctx.parameters, ctx.store.arrays, len(origins)
-        table, look = _arrays(grid), _arrays(appearance)
-        weights = surface_layers(_arrays(network._replace(hidden=hidden, output=output)))
+        table, look = as_arrays(grid), as_arrays(appearance)
+        weights = surface_layers(as_arrays(network._replace(hidden=hidden, output=output)))
         tracing_gradients.trace_backward(
-            *map(_array, (behind, g_features, g_weight, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
+            *map(as_array, (behind, g_features, g_weight, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
         )
         to_rays: list[Tensor | None] = [None, None]
         if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
             found = torch.empty(origins.shape), torch.empty(directions.shape)
             tracing_gradients.trace_rays_backward(
-                _array(origins), _array(directions), table, weights, look, arrays, *(x.numpy() for x in found)
+                as_array(origins), as_array(directions), table, weights, look, arrays, *(x.numpy() for x in found)
             )
             to_rays = list(found)
         if grid.table.requires_grad or appearance.table.requires_grad:
@@ -255,8 +214,8 @@ class _Compare(torch.autograd.Function):
         loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
         gradients = [torch.empty(x.shape) for x in (features, share, gain, mirrored)]
         shading.compare(
-            _arrays(rays), _arrays(measured), _array(gain), _array(mirrored), *_shader_layers(_arrays(tensors)), learn, arrays, loss,
-            squared.numpy(), *(g.numpy() for g in gradients),
+            as_arrays(rays), as_arrays(measured), as_array(gain), as_array(mirrored), *shader_layers(as_arrays(tensors)), learn, arrays,
+            loss, squared.numpy(), *(g.numpy() for g in gradients),
         )  # fmt: skip
         if learn:
             for name, weight in zip(ShaderWeights._fields, weights, strict=True):
@@ -278,8 +237,8 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     if isinstance(degrees, Tensor) or torch.is_grad_enabled():
         return reference.shade(weights, features, directions, degrees)
     outputs = torch.empty(len(features), len(weights.heads_bias))
-    layers, heads, biases = _shader_layers(_arrays(weights))
-    shading.shade(_array(features), _array(directions), degrees, layers, padded(heads.T), biases, outputs.numpy())
+    layers, heads, biases = shader_layers(as_arrays(weights))
+    shading.shade(as_array(features), as_array(directions), degrees, layers, padded(heads.T), biases, outputs.numpy())
     return outputs
 
 
@@ -289,7 +248,7 @@ def reflect(position: Tensor, mirrors: Mirrors) -> Reflection:
         return reference.reflect(position, mirrors)
     surfaces, count = len(mirrors.points), len(position)
     found = Reflection(torch.empty(surfaces, count), torch.empty(surfaces, count, 3), torch.empty(surfaces, count))
-    mirroring.reflect(_arrays(Lamps(position, torch.empty(count, 0))), _arrays(mirrors), *(x.numpy() for x in found))
+    mirroring.reflect(as_arrays(Lamps(position, torch.empty(count, 0))), as_arrays(mirrors), *(x.numpy() for x in found))
     return found
 
 
@@ -306,7 +265,7 @@ class _Mirror(torch.autograd.Function):
         position, spectrum, material, normals, share = differentiable
         out = torch.empty(len(measured.ray))
         mirrors = mirrors._replace(material=material, normals=normals, share=share)
-        mirroring.mirror(_arrays(Lamps(position, spectrum)), _arrays(mirrors), _array(behind), _arrays(measured), out.numpy())
+        mirroring.mirror(as_arrays(Lamps(position, spectrum)), as_arrays(mirrors), as_array(behind), as_arrays(measured), out.numpy())
         ctx.constants = behind, measured, mirrors.points, mirrors.directions
         ctx.save_for_backward(*differentiable)
         return out
@@ -320,90 +279,7 @@ class _Mirror(torch.autograd.Function):
         of_lamps = [torch.empty(chunks, *x.shape) for x in (position, spectrum)]
         mirrors = Mirrors(material, normals, points, directions, share)
         mirroring.mirror_backward(
-            _arrays(Lamps(position, spectrum)), _arrays(mirrors), _array(behind), _arrays(measured), _array(gradient),
+            as_arrays(Lamps(position, spectrum)), as_arrays(mirrors), as_array(behind), as_arrays(measured), as_array(gradient),
             mirroring.Gradients(*(x.numpy() for x in (*of_rows, *of_lamps))),
         )  # fmt: skip
         return None, None, None, *(x.sum(0) for x in of_lamps), *of_rows
-
-
-class _Made(NamedTuple):
-    """Of ``Arranged``: the step with arrays in the place of tensors, and what is drawn beside it."""
-
-    step: Any
-    ahead: tuple[ToFill, ...]
-
-
-@torch.no_grad()
-def arrange(step: Step, ahead: Sequence[Drawing] = ()) -> Arranged:
-    """See ``kernels.arrange``."""
-    arrays: list[Any] = [_arrays(x) if isinstance(x, tuple) else _compiled(x) for x in step]
-    of_step = Step(*arrays)._replace(sampling=_in_double(step.sampling))
-    return Arranged(step, tuple(ahead), _Made(of_step, tuple(to_fill(drawing) for drawing in ahead)))
-
-
-@torch.no_grad()
-def learn(
-    arranged: Arranged,
-    update: Callable[[], Sequence[AdamPart]] | None = None,
-    meanwhile: Callable[[Learned], None] | None = None,
-) -> Learned:
-    """See ``kernels.learn`` and ``learning.learn``; float32, ``measured.ray`` never decreasing."""
-    step, (made, ahead) = arranged.step, arranged.made
-    table, network, look, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = made
-    count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
-    chunks, threads = -(-count // CHUNK), get_num_threads()
-    tasks = chunks + -(-points // slopes.POINTS)
-    units, levels = len(network.hidden), len(table.resolutions)
-    features, hidden, used = FEATURES * len(look.resolutions), len(light.first), light.used
-    parts = len(light.second_bias) - len(light.position)
-    columns = np.concatenate([np.arange(parts), parts + used])
-    lamps = Lamps(light.position[used], np.exp(light.log_spectrum[used]))
-    shining = two_layers(light.first, light.first_bias, light.second[columns], light.second_bias[columns])
-    gain = np.empty(0, np.float32)
-    if len(gains.log_gain):
-        of_frames = np.exp(gains.log_gain - np.mean(gains.log_gain, dtype=np.float64)).astype(np.float32)
-        gain = of_frames[gains.frame]
-    store, taps = ray_store(threads, units, levels, len(look.resolutions)), tap_store(tasks, units, levels)
-    kept = table_store(chunks, units, levels, len(look.resolutions))
-    weights = shading_store(max(chunks, threads), shader)
-    scratch = chunk_scratch(threads, units, features, len(columns), hidden)
-    out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
-    squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
-    g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
-    first, second = (*(x.arrays for x in ahead), nothing_to_draw(), nothing_to_draw())[:2]
-    to_learn = (
-        np.zeros(2, np.int64), rays, states, sampling, table, surface_layers(network), look, *_shader_layers(shader), shining, lamps,
-        far_light, view, measured, gain, opacities, eikonal, first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays,
-        scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
-    )  # fmt: skip
-    sums, done = np.zeros(2), np.zeros(1 + table.active + look.active, np.int64)
-
-    def to_finish() -> tuple[Any, ...]:
-        learned = (*step.network[:2], *step.shader, *(step.light[:6] if len(used) else no_light("cpu")[:6]), step.far_light)
-        gradients = WeightGradients(*(gradient_of(x).numpy() for x in learned))
-        of_levels: dict[int, tuple[Any, int]] = {
-            step.grid.table.data_ptr(): (table.offsets[: table.active + 1], 1),
-            step.appearance.table.data_ptr(): (look.offsets[: look.active + 1], 1 + table.active),
-        }
-        return (
-            np.zeros(1, np.int64), done, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used,
-            lamps.spectrum, gradient_of(step.grid.table).numpy(), gradient_of(step.appearance.table).numpy(), gradients, sums,
-            *places_and_numbers(update() if update is not None else (), of_levels),
-        )  # fmt: skip
-
-    finish = take_beside(to_finish, threads, learning.learn_rays, to_learn)
-    loss = sums[0] = out.arrays.loss[:tasks].sum()
-    if len(gain):
-        by_frame = np.bincount(gains.frame, g_gain, len(of_frames)) * of_frames
-        of_gains = by_frame - by_frame.mean()
-        gradient_of(step.gains.log_gain).numpy()[...] += of_gains.astype(np.float32)
-        sums[1] = of_gains.sum()
-
-    def to_tell() -> Learned:
-        found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
-        result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(x.drawn for x in ahead))
-        if meanwhile is not None:
-            meanwhile(result)
-        return result
-
-    return take_beside(to_tell, threads, learning.finish, finish)
