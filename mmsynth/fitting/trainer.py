@@ -97,7 +97,7 @@ class Trainer:
             given = self.field, self.measurements, self.importance, self.optimiser, self.log_gain, self.needs, recipe, seed
             self.on_device = DeviceStep(*given)
             self.state.rays = max(self.state.rays, self.on_device.first_rays)
-        self.settled: tuple[Any, ...] = ()  # at the last step
+        self.settled: tuple[Any, ...] = ()  # by the last step: what is not learned but decided
         self.coming: DrawnStep | None = None
         self.arranged: tuple[ToDraw, kernels.Arranged] | None = None  # the next step, if nothing has changed since that it follows from
         self.points = eikonal_points(recipe, shines=False)  # those near what rays meet are left out where it shines
