@@ -12,6 +12,6 @@ from mmsynth.field.kernels import cuda
 def test_a_step_is_that_of_the_definition(device: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if device == "cuda":
         torch.set_default_device(device)
-    monkeypatch.setattr(kernels, "learn", cuda.learn)
+    monkeypatch.setattr(kernels, "learn", lambda arranged: cuda.learn(arranged.step))
     monkeypatch.setattr(test_learning, "RAYS", 36)
     test_learning.test_a_step_is_that_of_the_definition(case)
