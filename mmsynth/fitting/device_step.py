@@ -274,7 +274,7 @@ class DeviceStep:
                 p, moments = self.adam.parameters[name], self.adam.moments[name]
                 optimiser.guarded_adam(
                     p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, numbers.factors,
-                    self.steps, BETAS, EPSILON, sparse=True,
+                    self.steps, BETAS, self.adam.epsilons[name], sparse=True,
                 )  # fmt: skip
             stepping.tally(drawn, squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)
 

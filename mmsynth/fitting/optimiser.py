@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch
@@ -20,12 +20,20 @@ class Adam:
 
     Args:
         sparse: names of those of which a step changes only what has a gradient, see ``kernels.AdamStep``.
+        epsilons: of some, where it is not ``EPSILON``.
     Attributes:
         count: of steps.
     """
 
-    def __init__(self, parameters: dict[str, nn.Parameter], rates: dict[str, float], sparse: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        parameters: dict[str, nn.Parameter],
+        rates: dict[str, float],
+        sparse: Collection[str] = (),
+        epsilons: Mapping[str, float] | None = None,
+    ) -> None:
         self.parameters, self.rates, self.sparse = dict(parameters), rates, sparse
+        self.epsilons = dict.fromkeys(parameters, EPSILON) | dict(epsilons or {})
         self.moments = {n: [torch.zeros_like(p), torch.zeros_like(p)] for n, p in parameters.items()}
         self.count = 0
 
@@ -37,7 +45,7 @@ class Adam:
         parts = []
         for name, p in self.parameters.items():
             rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
-            step = kernels.AdamStep(rate, *BETAS, EPSILON, self.count + 1, name in self.sparse)
+            step = kernels.AdamStep(rate, *BETAS, self.epsilons[name], self.count + 1, name in self.sparse)
             first, second = self.moments[name]
             parts.append(kernels.AdamPart(p, gradient_of(p), first, second, step))
         return parts

@@ -142,8 +142,14 @@ class ScheduleRecipe(_Section):
     learning_rate_light: float = _key(8e-3, "Adam's rate of the lamps and of how surfaces mirror them [1/step].", gt=0)
     learning_rate_exposure: float = _key(1e-3, "Adam's rate of the log exposures [1/step].", gt=0)
     learning_rate_end_factor: float = _key(0.5, "All rates at the end [rate after the start].", gt=0, le=1)
+    surface_epsilon: float = _key(
+        2e-6,
+        "Adam's epsilon of the surface's table: rows of smaller gradients (root mean square; half of them have less) move less than by "
+        "the rate [1/parameter].",
+        gt=0,
+    )
     full_rate_sharpness: float = _key(
-        80.0, "Sharpness beyond which the surface's rates fall in proportion to 1 / sharpness [1/region radius].", gt=0
+        160.0, "Sharpness beyond which the surface's rates fall in proportion to 1 / sharpness [1/region radius].", gt=0
     )
     ema_fraction: float = _key(0.05, "Length of the mean over the last parameters [share of the fit]; 0: none.", ge=0, le=0.25)
 

@@ -81,7 +81,7 @@ class Trainer:
         of_lamps = {n for n in parameters if n.startswith("light.")}
         rates = {n: schedule.learning_rate_light if n in of_lamps else schedule.learning_rate_network for n in parameters}
         rates |= {**dict.fromkeys(tables, schedule.learning_rate_grid), _GAINS: schedule.learning_rate_exposure}
-        self.optimiser = Adam(parameters, rates, sparse=tables)
+        self.optimiser = Adam(parameters, rates, tables, {"surface.grid.table": schedule.surface_epsilon})
         self.average = Average(parameters)
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.state = FitState(rays=recipe.sampling.initial_rays, rays_after=recipe.sampling.initial_rays)

@@ -25,12 +25,12 @@ def _gradients(parameters: dict[str, nn.Parameter], step: int) -> None:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-14)])
-def test_parameters_have_rates_of_their_own(dtype: torch.dtype, tolerance: float) -> None:
+def test_parameters_have_rates_and_epsilons_of_their_own(dtype: torch.dtype, tolerance: float) -> None:
     ours, theirs = _parameters(dtype), _parameters(torch.float64)
     for name, p in theirs.items():
         p.data.copy_(ours[name].detach())
-    mine = Adam(ours, {"a.table": 0.02, "b": 0.005})
-    groups = [{"params": [theirs["a.table"]], "lr": 0.02}, {"params": [theirs["b"]], "lr": 0.005}]
+    mine = Adam(ours, {"a.table": 0.02, "b": 0.005}, epsilons={"b": 0.5})
+    groups = [{"params": [theirs["a.table"]], "lr": 0.02}, {"params": [theirs["b"]], "lr": 0.005, "eps": 0.5}]
     other = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
     for step, factor in enumerate((1.0, 0.5, 0.1, 0.1, 0.01)):
         _gradients(ours, step)
