@@ -31,13 +31,13 @@ from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.needs import SAMPLES_ON_GPU, Needs
 from mmsynth.fitting.optimiser import BETAS, EPSILON, Adam
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.schedule import blocked_weight, shallow_factor
+from mmsynth.fitting.schedule import SurfaceRates, blocked_weight, shallow_factor
 from mmsynth.fitting.terms import eikonal_points
 
 MOST_RAYS = 1 << 18
 _NEWS_EVERY = 16  # steps, and by as many the host is ahead of the device at the most: a fit of so many seconds ends when it should
 _PER_OCTAVE = 4  # numbers of rays for which there are graphs: within 10 % of what is asked for
-_TABLES = {"surface.grid.table": 1, "appearance.table": 0}  # and which of ``Numbers.factors`` is theirs
+_TABLES = {"surface.grid.table": 2, "appearance.table": 0}  # and which of ``Numbers.factors`` is theirs
 
 
 @dataclass(frozen=True)
@@ -191,11 +191,11 @@ class DeviceStep:
             self.pool = torch.cuda.graph_pool_handle() if self.field.device.type == "cuda" else None  # memory of graphs goes with them
         self.tables = tables
 
-    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, surface_factor: float) -> None:
+    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, of_surface: SurfaceRates) -> None:
         """A step, of rays where they go by now.
 
         Args:
-            number: of the step, for its random numbers. factor: of all learning rates. surface_factor: of the surface's, beside.
+            number: of the step, for its random numbers. factor: of all learning rates. of_surface: of the surface's, beside.
         """
         if stage not in self.works:
             self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture, self.pool)
@@ -204,7 +204,7 @@ class DeviceStep:
             self.selection.ends.copy_(self.chosen.ends)
             self.selection.weight.copy_(self.chosen.weight)
         key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
-        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, surface_factor, key)
+        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, of_surface, key)
         self.works[stage]()
         self.rays += sum(stage.rays)
         if (number + 1) % _NEWS_EVERY == 0:

@@ -149,7 +149,10 @@ class ScheduleRecipe(_Section):
         gt=0,
     )
     full_rate_sharpness: float = _key(
-        80.0, "Sharpness beyond which the surface's rates fall in proportion to 1 / sharpness [1/region radius].", gt=0
+        80.0, "Sharpness beyond which the rates of the surface's network fall in proportion to 1 / sharpness [1/region radius].", gt=0
+    )
+    full_rate_sharpness_table: float = _key(
+        320.0, "Sharpness beyond which the rate of the surface's table falls in proportion to 1 / sharpness [1/region radius].", gt=0
     )
     ema_fraction: float = _key(0.05, "Length of the mean over the last parameters [share of the fit]; 0: none.", ge=0, le=0.25)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from mmsynth.field.kernels import Sampling
 from mmsynth.fitting.needs import Needs
@@ -41,13 +42,22 @@ def samples_of_step(progress: float, recipe: Recipe) -> float:
     return recipe.sampling.samples_per_step * recipe.sampling.samples_growth ** (progress - 0.5)
 
 
-def surface_rate_factor(sharpness: float, recipe: Recipe) -> float:
+class SurfaceRates(NamedTuple):
+    """Factors of the learning rates of the surface's network and of its table."""
+
+    network: float
+    table: float
+
+
+def surface_rates(sharpness: float, recipe: Recipe) -> SurfaceRates:
     """Beyond some sharpness the surface's rates fall in proportion to the width of the soft surface.
 
     A step of Adam moves the surface by about its rate, whatever the gradient. Where that is a good part of the soft surface,
-    the surface never settles: colours blur and views disagree.
+    the surface never settles: colours blur and views disagree. The network moves all of the surface at once, which goes to and fro
+    for hundreds of steps where it is fast; rows of the table move a cell each, and those that few rays agree on less (``surface_epsilon``).
     """
-    return min(1.0, recipe.schedule.full_rate_sharpness / sharpness)
+    rates = recipe.schedule
+    return SurfaceRates(min(1.0, rates.full_rate_sharpness / sharpness), min(1.0, rates.full_rate_sharpness_table / sharpness))
 
 
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:

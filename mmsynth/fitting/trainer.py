@@ -31,7 +31,7 @@ from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.progress import FitProgress, FitState
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, samples_of_step, sampling_at, surface_rate_factor
+from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, samples_of_step, sampling_at, surface_rates
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, eikonal_points, opacities
@@ -189,7 +189,7 @@ class Trainer:
         state, done = self.state, self.progress
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
-        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rate_factor(sampling.sharpness, self.recipe))
+        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rates(sampling.sharpness, self.recipe))
         self._average()
         state.rays_total += sum(stage.rays)
         state.step += 1
@@ -283,7 +283,8 @@ class Trainer:
 
     def _update(self, sampling: kernels.Sampling) -> list[kernels.AdamPart]:
         """What a step of the optimiser takes."""
-        slower = dict.fromkeys(self.of_surface, surface_rate_factor(sampling.sharpness, self.recipe))
+        rates = surface_rates(sampling.sharpness, self.recipe)
+        slower = {n: rates.table if n.endswith(".table") else rates.network for n in self.of_surface}
         return self.optimiser.parts(learning_rate_factor(self.progress, self.recipe), slower)
 
     def _average(self) -> None:

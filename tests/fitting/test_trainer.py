@@ -52,8 +52,9 @@ SMALL = Recipe().with_changes({
     "sampling.min_section_weight": 0.01, "sampling.max_optical_depth": 3.0, "schedule.levels_until": 0.4,
     "schedule.view_dependence_from": 0.3, "schedule.decide_at": 0.6, "radiance.view_dependence": 2, "radiance.exposure": "off",
     "radiance.light": "off",
-    "surface.measurements_per_cell": 1e-3, "schedule.full_rate_sharpness": 200.0, "schedule.learning_rate_grid": 2e-2,
-    "schedule.learning_rate_network": 8e-3, "schedule.learning_rate_end_factor": 0.1, "schedule.ema_fraction": 0.05,
+    "surface.measurements_per_cell": 1e-3, "schedule.full_rate_sharpness": 200.0, "schedule.full_rate_sharpness_table": 800.0,
+    "schedule.learning_rate_grid": 2e-2, "schedule.learning_rate_network": 8e-3,
+    "schedule.learning_rate_end_factor": 0.1, "schedule.ema_fraction": 0.05,
     "loss.eikonal_weight": 0.05, "loss.eikonal_points": 128, "loss.background_opacity_weight": 0.02, "loss.alpha_weight": 0.5,
 })  # fmt: skip
 

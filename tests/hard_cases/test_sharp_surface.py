@@ -12,11 +12,18 @@ from mmsynth.field.kernels import Rays, Sampling, reference
 from mmsynth.field.surface import Surface
 from mmsynth.fitting.optimiser import Adam
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.schedule import surface_rate_factor
+from mmsynth.fitting.schedule import surface_rates
+
+OF_ROWS = 1.2e-6  # median of the root mean square of the gradients of a table's rows, measured in fits of photographs
 
 
-def _moved(sharpness: float, slower: bool = True) -> float:
-    """How far noise, which asks for nothing, makes the surface tremble late in a fit, in widths of the soft surface."""
+def _moved(sharpness: float, size: float, slower: bool = True, epsilon: float | None = None) -> float:
+    """How far noise, which asks for nothing, makes the surface tremble late in a fit, in widths of the soft surface.
+
+    Args:
+        size: of the noise, as the median of the root mean square of the gradients of the table's rows. slower: as a fit is, where the
+            surface is sharp. epsilon: of the table, None: a fit's.
+    """
     torch.manual_seed(0)
     recipe = Recipe()
     rates = recipe.schedule
@@ -26,28 +33,47 @@ def _moved(sharpness: float, slower: bool = True) -> float:
     optimiser = Adam(
         parameters,
         {n: rates.learning_rate_grid if n == "grid.table" else rates.learning_rate_network for n in parameters},
+        epsilons={"grid.table": rates.surface_epsilon if epsilon is None else epsilon},
     )
-    factors = dict.fromkeys(parameters, surface_rate_factor(sharpness, recipe) if slower else 1.0)
+    own = surface_rates(sharpness, recipe) if slower else (1.0, 1.0)
+    factors = {n: own[n == "grid.table"] for n in parameters}
     points = torch.nn.functional.normalize(torch.randn(2000, 3), dim=-1) * 0.5
+    noise = lambda scale: (scale * surface(points, 4) * torch.randn(len(points))).sum().backward()
+    noise(1.0)
+    assert surface.grid.table.grad is not None
+    rows = surface.grid.table.grad.square().mean(-1).sqrt()
+    scale = size / float(rows[rows > 0].median())
+    optimiser.clear()
     trembling = []
     for _ in range(20):
         before = surface(points, 4).detach()
-        (surface(points, 4) * torch.randn(len(points))).sum().backward()
+        noise(scale)
         optimiser.step(rates.learning_rate_end_factor, factors)
         trembling.append(float((surface(points, 4).detach() - before).square().mean().sqrt()))
     return sum(trembling) / len(trembling) * sharpness / 3.5
 
 
 @pytest.mark.parametrize("sharpness", [400.0, 800.0, 3200.0])
-def test_noise_moves_a_surface_by_less_than_a_quarter_of_its_softness_however_sharp(
+def test_noise_moves_a_surface_by_less_than_a_third_of_its_softness_however_sharp(
     row: Callable[[str, str, str], None], sharpness: float
 ) -> None:
-    """Measured on photographs: 0.17 is as good as less (the mean over the last steps rests), 0.43 costs 1.7 dB, more everything."""
-    usual, ours = _moved(sharpness, slower=False), _moved(sharpness)
-    assert ours < 0.25 and usual > 0.4 and usual > 2 * ours
+    """Measured on photographs: 0.26 is better than 0.12 (the mean over the last steps rests), 0.43 costs 1.7 dB, more everything."""
+    usual, ours = _moved(sharpness, OF_ROWS, slower=False, epsilon=1e-15), _moved(sharpness, OF_ROWS)
+    assert ours < 0.3 and usual > 0.4 and usual > 2 * ours
     row(
         f"noise in the gradients of a surface of sharpness {sharpness:.0f}",
         f"Adam at one rate: trembles by {usual:.2g} of its softness",
+        f"{ours:.2g}",
+    )
+
+
+def test_what_few_rays_tell_a_table_moves_it_by_less(row: Callable[[str, str, str], None]) -> None:
+    """Adam's step is its rate however small a gradient is. What is left is the network's, which all rays tell something."""
+    usual, ours = _moved(320.0, 0.05 * OF_ROWS, epsilon=1e-15), _moved(320.0, 0.05 * OF_ROWS)
+    assert ours < 0.15 and usual > 0.3
+    row(
+        "gradients of a table's rows a twentieth as large as usual, all of it noise",
+        f"Adam without an epsilon: the surface trembles by {usual:.2g} of its softness",
         f"{ours:.2g}",
     )
 
