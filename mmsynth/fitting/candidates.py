@@ -39,9 +39,16 @@ class Look:
 
 
 @torch.no_grad()
-def look(field: Field, measurements: Measurements, rays: int, sampling: kernels.Sampling, random: np.random.Generator) -> Look:
-    """So many rays of each modality, as the field renders them."""
-    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random)
+def look(
+    field: Field,
+    measurements: Measurements,
+    rays: int,
+    sampling: kernels.Sampling,
+    random: np.random.Generator,
+    selection: kernels.Selection | None = None,
+) -> Look:
+    """So many rays of each modality, as the field renders them; ``selection``: of which pixels, None: of all that are learned from."""
+    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, selection)
     hits = field.trace(batch.origins, batch.directions, sampling)
     return Look(batch, hits, field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface))
 

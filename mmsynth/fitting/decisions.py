@@ -1,6 +1,6 @@
 """Two questions that residuals answer during a fit: how far radiance depends on direction, and whether exposures differ between frames.
 
-Rays of all frames are compared with what was measured: see ``candidates``.
+Rays are compared with what was measured, see ``candidates``: of views that are held out, see ``held_out``, and of all for exposures.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.candidates import Look, look, squared_errors
 from mmsynth.fitting.choices import Choice, switch
+from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import RadianceRecipe
 
@@ -38,12 +39,15 @@ class Decisions:
         return {**{f"view_dependence.{name}": choice for name, choice in self.view_dependence.items()}, "exposure": self.exposure}
 
 
-def decide(field: Field, measurements: Measurements, recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int) -> Decisions:
-    """Put the residuals of a field as it is to the tests of this module."""
+def decide(
+    field: Field, measurements: Measurements, recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int, held: Tensor | None
+) -> Decisions:
+    """Put the residuals of a field as it is to the tests of this module; ``held``: tiles that it has not learned directions from."""
     random = np.random.default_rng((seed, 2))
-    learned, judged = (look(field, measurements, rays, sampling, random) for rays in (_RAYS // 2, _RAYS))
+    judged = look(field, measurements, _RAYS, sampling, random)
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, learned, judged)
+        sides = zip((_RAYS // 2, _RAYS), selections(measurements, held), strict=True)
+        errors = errors_by_degree(field.shader, *(look(field, measurements, rays, sampling, random, some) for rays, some in sides))
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         asked = recipe.view_dependence

@@ -63,7 +63,7 @@ class Modality:
     Attributes:
         cameras: without repetition. camera_index: (F,), of each frame.
         rotations, origins: (F, 3, 3), (F, 3) float32, camera to world, normalised frame.
-        digests: of each frame, a hash of its values.
+        digests: of each frame, a hash of its values. views: (F,) int, which it is of.
         total: how many pixels. pixels: of these, how many numbers are learned from: with a ray, and within the mask where masks are
             ``object`` or ``ignore``. empty: with a ray outside an object's mask: nothing is there.
         masked: frames with a mask that is learned from. has_alpha: whether a frame has alpha.
@@ -76,6 +76,7 @@ class Modality:
     rotations: np.ndarray
     origins: np.ndarray
     digests: Sequence[bytes]
+    views: np.ndarray
     total: int
     pixels: int
     empty: int
@@ -255,7 +256,8 @@ def measure(
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
         own = slice(first_frame[n], first_frame[n + 1])
         of[name] = Modality(
-            sensor, cameras[n], index, *_rotations_origins(poses), stored.digest[own], totals[n], int(inside.pixels.sum()),
+            sensor, cameras[n], index, *_rotations_origins(poses), stored.digest[own],
+            np.array([f.view for f in of_sensor]), totals[n], int(inside.pixels.sum()),
             int(outside.pixels.sum()), masked, has_alpha=bool((stored.stride[own] > _values(sensor)).any()),
         )  # fmt: skip
     pairs = [(tile, f.camera) for tile, of_sensor in zip(tiles, listed, strict=True) for f in of_sensor]

@@ -61,7 +61,9 @@ class RadianceRecipe(_Section):
     cells_per_row: float = _key(1.5, "Cells of the finest level at the surface that share a row of its table [cells].", gt=0)
     rays_per_row: float = _key(50.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)
     hidden_width: int = _key(64, "Width of the shader's hidden layer.", ge=4, le=256)
-    view_dependence: Literal["auto", 0, 1, 2, 3] = _key("auto", "Degree of the spherical harmonics of radiance over directions.")
+    view_dependence: Literal["auto", 0, 1, 2, 3] = _key(
+        "auto", "Degree of the spherical harmonics of radiance over directions; auto: views judge that are held out until then."
+    )
     view_dependence_min_improvement: float = _key(
         0.05, "Share of the error that a higher degree must save [1], where the degree is auto.", ge=0
     )

@@ -22,6 +22,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting.ahead import DrawnStep, ToDraw, drawn_step
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import DEGREES, Decisions, decide
+from mmsynth.fitting.held_out import held_out_tiles
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.measurements import Batch, Measurements, draw, drawing_of, empty_drawing_of, fingerprint, load_measurements
@@ -88,6 +89,7 @@ class Trainer:
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
         self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
+        self.held = held_out_tiles(self.measurements)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())
         self.has_empty = self.measurements.empty is not None
         self.on_device: DeviceStep | None = None
@@ -219,8 +221,10 @@ class Trainer:
             share = 1.0 if state.step == 0 else 1 / 16
             if not field.occupancy.update(field.surface.at(sampling.active_surface), sampling.sharpness, generator, share):
                 state.reopened += 1
+        on_trial = self.recipe.radiance.view_dependence == "auto" and schedule.view_dependence_from <= self.progress
+        held = self.held if on_trial and state.decided is None else None
         if state.step % _RENEW_EVERY == 0:
-            self.importance.renew()
+            self.importance.renew(held)
             self.arranged = None
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
@@ -239,7 +243,7 @@ class Trainer:
             seen = 0 if self.progress < schedule.view_dependence_from else DEGREES
             field.view_dependence.update(dict.fromkeys(self.measurements, seen))
             if self.progress >= schedule.decide_at:
-                state.decided = decide(field, self.measurements, self.recipe.radiance, sampling, self.seed)
+                state.decided = decide(field, self.measurements, self.recipe.radiance, sampling, self.seed, held)
                 if field.shines:  # by now lamps have found their places
                     keep_bright_lamps(field, self.measurements, sampling, self.seed)
                 self._see_directions(state.decided)

@@ -21,7 +21,7 @@ NARROW = Camera(64, 48, 200.0, 200.0, 31.5, 23.5)
 
 def _modality(cameras: list[Camera], poses: np.ndarray) -> Modality:
     rotations, origins = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
-    return Modality(None, cameras, np.arange(len(cameras)), rotations, origins, [], 1, 1, 0, 0, False)  # type: ignore[arg-type]
+    return Modality(None, cameras, np.arange(len(cameras)), rotations, origins, [], np.arange(len(cameras)), 1, 1, 0, 0, False)  # type: ignore[arg-type]
 
 
 def _looking_inwards(stands: list[list[float]]) -> np.ndarray:

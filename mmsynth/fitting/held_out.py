@@ -1,0 +1,49 @@
+"""Views that are not learned from while directions are on trial.
+
+What a fit has learned of a view says little of the views between: appearance can hold a colour for each camera. So every eighth view is
+held out from when radiance first depends on direction until it is decided how far it does, which these views judge.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mmsynth.field import kernels
+from mmsynth.fitting.measurements import Measurements
+
+_EVERY, _FIRST = 8, 4  # of the views in order; fewer than so many are all learned from
+
+
+def held_out_tiles(measurements: Measurements) -> Tensor | None:
+    """(T,) bool, which tiles are of views that are held out, None: no view is. Modalities that have no other view, too, keep theirs."""
+    views = np.concatenate([measurements[n].views for n in measurements.order])
+    known = np.unique(views)
+    if len(known) < _EVERY:
+        return None
+    held = torch.from_numpy(np.isin(views, known[_FIRST::_EVERY]))
+    tiles, pixels = measurements.frames.first_tile.cpu(), measurements.chosen.pixels.cpu()
+    out = held[torch.searchsorted(tiles, torch.arange(len(pixels)), right=True) - 1]
+    for begin, end in pairwise(measurements.modalities.first_tile.tolist()):
+        own, drawn = out[begin:end], pixels[begin:end]
+        if not drawn[own].any() or not drawn[~own].any():
+            out[begin:end] = False
+    return out.to(measurements.chosen.pixels.device)
+
+
+def selections(measurements: Measurements, held: Tensor | None) -> tuple[kernels.Selection, kernels.Selection]:
+    """Of the pixels of the views that are learned from, and of those held out; of all pixels of a modality where none is held out."""
+    chosen, first_tile = measurements.chosen, measurements.modalities.first_tile.cpu()
+    if held is None:
+        return chosen, chosen
+    judging = held.clone()
+    for begin, end in pairwise(first_tile.tolist()):
+        judging[begin:end] |= ~held[begin:end].any()
+    even = torch.ones_like(chosen.weight)
+    some = lambda tiles: chosen._replace(
+        **dict(zip(("ends", "weight"), kernels.odds(even, chosen.pixels * tiles, first_tile, 1.0), strict=True))
+    )
+    return some(~held), some(judging)
