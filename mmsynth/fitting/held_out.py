@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.field import kernels
+from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.measurements import Measurements
 
 _EVERY, _FIRST = 8, 4  # of the views in order; fewer than so many are all learned from
@@ -36,14 +37,16 @@ def held_out_tiles(measurements: Measurements) -> Tensor | None:
 
 def selections(measurements: Measurements, held: Tensor | None) -> tuple[kernels.Selection, kernels.Selection]:
     """Of the pixels of the views that are learned from, and of those held out; of all pixels of a modality where none is held out."""
-    chosen, first_tile = measurements.chosen, measurements.modalities.first_tile.cpu()
+    chosen, first_tile = measurements.chosen, measurements.modalities.first_tile
     if held is None:
         return chosen, chosen
-    judging = held.clone()
+    not_judging = ~held
     for begin, end in pairwise(first_tile.tolist()):
-        judging[begin:end] |= ~held[begin:end].any()
-    even = torch.ones_like(chosen.weight)
-    some = lambda tiles: chosen._replace(
-        **dict(zip(("ends", "weight"), kernels.odds(even, chosen.pixels * tiles, first_tile, 1.0), strict=True))
-    )
-    return some(~held), some(judging)
+        not_judging[begin:end] &= held[begin:end].any()
+    even = Importance(chosen, first_tile, evenly=1.0)
+
+    def all_but(tiles: Tensor) -> kernels.Selection:
+        even.renew(tiles)
+        return even.selection
+
+    return all_but(held), all_but(not_judging)

@@ -10,6 +10,7 @@ import torch
 sys.path.append(str(Path(__file__).parents[1] / "hard_cases"))
 from small_scenes import around, write_scene
 
+from mmsynth.field import kernels
 from mmsynth.fitting.held_out import held_out_tiles, selections
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.measurements import Measurements, draw, load_measurements
@@ -20,9 +21,9 @@ def _measurements(folder: Path, **views: int) -> Measurements:
     return load_measurements(load_scene(write_scene(folder, {name: around(count) for name, count in views.items()})))
 
 
-def _drawn(measurements: Measurements, selection: object) -> dict[str, set[int]]:
+def _drawn(measurements: Measurements, selection: kernels.Selection) -> dict[str, set[int]]:
     """The views of each modality that 2,000 rays of it come from."""
-    batch = draw(measurements, None, dict.fromkeys(measurements, 2000), np.random.default_rng(0), selection)  # type: ignore[arg-type]
+    batch = draw(measurements, None, dict.fromkeys(measurements, 2000), np.random.default_rng(0), selection)
     views = np.concatenate([measurements[n].views for n in measurements.order])
     return {name: set(views[batch.frame[numbers].numpy()].tolist()) for name, (_, numbers) in batch.parts.items()}
 
