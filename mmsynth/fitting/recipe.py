@@ -154,7 +154,7 @@ class ScheduleRecipe(_Section):
         80.0, "Sharpness beyond which the rates of the surface's network fall in proportion to 1 / sharpness [1/region radius].", gt=0
     )
     full_rate_sharpness_table: float = _key(
-        320.0, "Sharpness beyond which the rate of the surface's table falls in proportion to 1 / sharpness [1/region radius].", gt=0
+        220.0, "Sharpness beyond which the rate of the surface's table falls in proportion to 1 / sharpness [1/region radius].", gt=0
     )
     ema_fraction: float = _key(0.05, "Length of the mean over the last parameters [share of the fit]; 0: none.", ge=0, le=0.25)
 

@@ -54,12 +54,13 @@ def _moved(sharpness: float, size: float, slower: bool = True, epsilon: float | 
 
 
 @pytest.mark.parametrize("sharpness", [400.0, 800.0, 3200.0])
-def test_noise_moves_a_surface_by_less_than_a_third_of_its_softness_however_sharp(
+def test_noise_moves_a_surface_by_less_than_a_quarter_of_its_softness_however_sharp(
     row: Callable[[str, str, str], None], sharpness: float
 ) -> None:
-    """Measured on photographs: 0.26 is better than 0.12 (the mean over the last steps rests), 0.43 costs 1.7 dB, more everything."""
-    usual, ours = _moved(sharpness, OF_ROWS, slower=False, epsilon=1e-15), _moved(sharpness, OF_ROWS)
-    assert ours < 0.3 and usual > 0.4 and usual > 2 * ours
+    """Whatever the size of the noise. Measured on photographs: 0.26 is as good as 0.12 (the mean over the last steps rests), 0.43 costs
+    1.7 dB, more everything."""
+    usual, ours = _moved(sharpness, OF_ROWS, slower=False, epsilon=1e-15), max(_moved(sharpness, n * OF_ROWS) for n in (1, 1000))
+    assert ours < 0.25 and usual > 0.4 and usual > 2 * ours
     row(
         f"noise in the gradients of a surface of sharpness {sharpness:.0f}",
         f"Adam at one rate: trembles by {usual:.2g} of its softness",
@@ -70,7 +71,7 @@ def test_noise_moves_a_surface_by_less_than_a_third_of_its_softness_however_shar
 def test_what_few_rays_tell_a_table_moves_it_by_less(row: Callable[[str, str, str], None]) -> None:
     """Adam's step is its rate however small a gradient is. What is left is the network's, which all rays tell something."""
     usual, ours = _moved(320.0, 0.05 * OF_ROWS, epsilon=1e-15), _moved(320.0, 0.05 * OF_ROWS)
-    assert ours < 0.15 and usual > 0.3
+    assert ours < 0.1 and usual > 2 * ours
     row(
         "gradients of a table's rows a twentieth as large as usual, all of it noise",
         f"Adam without an epsilon: the surface trembles by {usual:.2g} of its softness",
