@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 _COLUMNS = {
     "psnr": "psnr [dB]",
+    "psnr_view_mean": "view mean",
     "psnr_foreground": "foreground",
     "psnr_foreground_view_mean": "view mean",
     "ssim": "ssim",
@@ -49,8 +50,8 @@ def score_text(scores: Mapping[str, Any]) -> str:
     """The result of ``evaluate`` as lines: one row per modality, then geometry and speed."""
     modalities: Mapping[str, Mapping[str, Any]] = scores["modalities"]
     sources = {m["foreground_from"] for m in modalities.values() if "foreground_from" in m}
-    told = {k for m in modalities.values() for k in m} - ({"psnr_foreground_view_mean"} if "masks" not in sources else set())
-    keys = [k for k in _COLUMNS if k in told]
+    told = {k for m in modalities.values() for k in m}
+    keys = [k for k in _COLUMNS if k in told and (not k.endswith("view_mean") or "masks" in sources)]
     lines = ["".join([f"{'modality':10s}"] + [f"{_COLUMNS[k]:>12s}" for k in keys])]
     for name, m in modalities.items():
         label = f"{name} *" if m.get("predicted") else name
@@ -58,7 +59,7 @@ def score_text(scores: Mapping[str, Any]) -> str:
     if any(m.get("predicted") for m in modalities.values()):
         lines.append("*: predicted by a prior, not measured; free gain: aligned, with the one gain that suits best")
     if "masks" in sources:
-        lines.append("foreground: within the masks, dB of the error pooled over all views; view mean: the mean of dB over views")
+        lines.append("foreground: within the masks; dB of the error pooled over all views, then view mean: the mean of dB over views")
     if "opacity" in sources:
         lines.append("foreground: the field's own opacity > 0.5, for want of masks; not comparable between fits")
     lines += [f"{key}: {value:.5g}" for key, value in scores.get("geometry", {}).items() if isinstance(value, float)]

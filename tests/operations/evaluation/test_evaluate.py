@@ -159,7 +159,9 @@ def test_foreground_is_scored_pooled_and_as_the_mean_of_db_over_views(tmp_path: 
     assert found["psnr_foreground"] == pytest.approx(-10 * np.log10((0.1**2 + 0.001**2) / 2), abs=0.02)
     assert found["psnr_foreground_view_mean"] == pytest.approx((20 + 60) / 2, abs=0.1)
     text = score_text({"modalities": {"rgb": found}})
-    assert "foreground" in text and "view mean" in text and f"{found['psnr_foreground_view_mean']:.3f}" in text
+    told = ("psnr", "psnr_view_mean", "psnr_foreground", "psnr_foreground_view_mean", "ssim")
+    assert text.splitlines()[0].split() == "modality psnr [dB] view mean foreground view mean ssim".split()
+    assert text.splitlines()[1].split() == ["rgb", *(f"{found[k]:.3f}" for k in told)]
 
 
 def test_all_pixels_are_scored_pooled_and_as_the_mean_of_db_over_views(tmp_path: Path) -> None:
