@@ -42,14 +42,17 @@ def test_threads_are_given_back() -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs Linux's /proc")
 def test_peak_memory_is_the_process_own() -> None:
-    """A child of a large process is not large itself, and a peak stays when the memory is given back."""
-    large = np.ones(150_000_000, np.uint8)
+    """A child of a large process is not large itself, and a peak stays when the memory is given back.
+
+    Both told by the child, by hundreds of MB: Linux counts pages per core in batches, so what it tells of a peak may fall by some of them.
+    """
+    large = np.ones(300_000_000, np.uint8)
     mine = machine.peak_memory()
     assert mine > large.nbytes
-    del large
-    assert machine.peak_memory() >= mine
-    code = "from mmsynth.bench.machine import peak_memory; import numpy; a = numpy.ones(50_000_000); del a; print(peak_memory())"
+    code = "import numpy; from mmsynth.bench.machine import peak_memory as p; one = p(); a = numpy.ones(50_000_000); del a; print(one, p())"
     said = subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True
     )
-    assert 400_000_000 < int(said.stdout) < 400_000_000 + mine
+    before, after = map(int, said.stdout.split())
+    assert before < mine - large.nbytes / 2
+    assert before + 300_000_000 < after < before + 420_000_000
