@@ -18,7 +18,7 @@ from mmsynth.report.run_pictures import measured_channels
 from mmsynth.report.text import converted_text
 from mmsynth.scene.images import image_size, read_image
 from mmsynth.scene.preview_colours import PreviewColours, preview_colours_of
-from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.scene.scene import Frame, MaskMeaning, Scene, Sensor
 from mmsynth.sensors.camera import Camera
 
 _SHOWN = 12  # frames with pictures
@@ -75,16 +75,16 @@ def source_previews(scene: Scene, sensor: Sensor, images: Sequence[Path] = ()) -
             if path.name == name:
                 # of a camera only the size is asked for
                 frame = Frame(sensor.name, 0, path, Camera(*image_size(path), 1.0, 1.0, 0.0, 0.0), np.eye(4))
-                return _preview(sensor, frame, colours)
-        return next((_preview(scene.sensors[sensor.name], frame, colours) for frame in own if frame.path.name == name and not images), None)
+                return _preview(sensor, frame, scene.masks, colours)
+        frames = (frame for frame in own if frame.path.name == name and not images)
+        return next((_preview(scene.sensors[sensor.name], frame, scene.masks, colours) for frame in frames), None)
 
     return preview
 
 
-def _preview(sensor: Sensor, frame: Frame, colours: PreviewColours | None) -> np.ndarray:
-    return previews.to_uint8(
-        previews.reduced(previews.tone_map(previews.preview_linear(sensor, measured_channels(sensor, frame), colours)))
-    )
+def _preview(sensor: Sensor, frame: Frame, masks: MaskMeaning, colours: PreviewColours | None) -> np.ndarray:
+    linear = previews.preview_linear(sensor, measured_channels(sensor, frame, masks), colours)
+    return previews.to_uint8(previews.reduced(previews.tone_map(linear)))
 
 
 def _row(folder: Path, facts: Mapping[str, Any], frame_of: Callable[[str], np.ndarray | None]) -> Row:

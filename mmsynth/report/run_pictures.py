@@ -23,8 +23,9 @@ from mmsynth.report.pictures import (
     spectra_width,
 )
 from mmsynth.scene.images import load_frame
+from mmsynth.scene.masks import read_mask
 from mmsynth.scene.preview_colours import preview_colours_of
-from mmsynth.scene.scene import Frame, Scene, Sensor
+from mmsynth.scene.scene import Frame, MaskMeaning, Scene, Sensor
 from mmsynth.sensors.camera import Camera, every_nth
 from mmsynth.sensors.mosaic import channels_of, demosaic_edge_aware, is_bayer
 from mmsynth.sensors.polarization import intensities_to_stokes
@@ -34,20 +35,24 @@ if TYPE_CHECKING:
     from mmsynth.field.picture import Rendering
 
 
-def measured_channels(sensor: Sensor, frame: Frame) -> np.ndarray:
-    """A frame with all channels at every pixel (H, W, C), demosaicked for display; times its alpha, as it is fitted and scored."""
+def measured_channels(sensor: Sensor, frame: Frame, masks: MaskMeaning) -> np.ndarray:
+    """A frame with all channels at every pixel (H, W, C), demosaicked for display; times its alpha, and black outside of the mask of an
+    object, as it is fitted and scored."""
     pixels, alpha = load_frame(sensor, frame)
     if alpha is not None:
         pixels = pixels * alpha[..., None]
     if sensor.mosaic is not None and is_bayer(sensor.mosaic):
-        return np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
-    return channels_of(pixels, sensor.mosaic)
+        channels = np.moveaxis(demosaic_edge_aware(pixels, sensor.mosaic), 0, -1)
+    else:
+        channels = channels_of(pixels, sensor.mosaic)
+    mask = read_mask(frame) if masks == "object" else None
+    return channels if mask is None else channels * mask[..., None]
 
 
 @dataclass
 class _Seen:
-    """A modality at a view, before the scale of all errors is known: error (H, W) of the pixels shown, NaN = no ray, and what comes before
-    and after it."""
+    """A modality at a view, before the scale of all errors is known: error (H, W) of the pixels shown, NaN = no ray or ignored, and what
+    comes before and after it."""
 
     title: str
     error: np.ndarray
@@ -92,7 +97,8 @@ def _shown_of(frame: Frame) -> tuple[Camera, int]:
 def _seen(field: Field, scene: Scene, frame: Frame, rendering: Rendering, numbers: int) -> _Seen:
     name = frame.sensor
     camera, n = _shown_of(frame)
-    sensor, measured, ours = field.sensors[name], measured_channels(scene.sensors[name], frame)[::n, ::n], rendering.channels[name]
+    sensor, ours = field.sensors[name], rendering.channels[name]
+    measured = measured_channels(scene.sensors[name], frame, scene.masks)[::n, ::n]
     colours = preview_colours_of(scene.sensors[name], scene.frames_of(name))
     linear = previews.preview_linear(sensor, measured, colours)
     exposure = previews.exposure_of(linear)
@@ -104,7 +110,9 @@ def _seen(field: Field, scene: Scene, frame: Frame, rendering: Rendering, number
     if sensor.polarizer_angles_deg is not None:
         stokes = intensities_to_stokes(torch.from_numpy(measured), sensor.polarizer_angles_deg).numpy()
         after = _polarization(name, stokes, rendering.stokes[name])
-    error = np.where(rendering.valid, np.abs(ours - measured).mean(-1), np.nan)
+    mask = read_mask(frame) if scene.masks == "ignore" else None
+    compared = rendering.valid if mask is None else rendering.valid & mask[::n, ::n]
+    error = np.where(compared, np.abs(ours - measured).mean(-1), np.nan)
     spectra = spectra_of(sensor, spectra_width(camera.width, camera.height, numbers), measured=measured, rendered=ours)
     return _Seen(name, error, [Wipe(theirs, rendered), rendered], after, spectra)
 

@@ -234,7 +234,7 @@ class Viewer:
         """A frame's preview, linear and not exposed, (H, W, 3)."""
         assert self.scene is not None
         sensor = self.scene.sensors[frame.sensor]
-        return previews.preview_linear(sensor, measured_channels(sensor, frame), self.colours.get(frame.sensor))
+        return previews.preview_linear(sensor, measured_channels(sensor, frame, self.scene.masks), self.colours.get(frame.sensor))
 
     def training(self) -> TrainingRays | None:
         """The training frames' depth maps, made when they are first asked for; of a field that still changes there are none."""
@@ -312,7 +312,7 @@ class Viewer:
     def _preview_of(self, name: str, view: int) -> np.ndarray:
         assert self.scene is not None
         sensor, (frame, *_) = self.scene.sensors[name], self.scene.frames_of(name, (view,))
-        return previews.preview_rgb(sensor, measured_channels(sensor, frame), None, self.colours.get(frame.sensor))
+        return previews.preview_rgb(sensor, measured_channels(sensor, frame, self.scene.masks), None, self.colours.get(frame.sensor))
 
     # ------------------------------------------------------------------------------------------------------------- browsers
 

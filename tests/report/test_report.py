@@ -18,8 +18,9 @@ from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.output import previews
 from mmsynth.report.report import curve_svg, measured_channels, read_log, write_run_report
 from mmsynth.report.run_pictures import picture_rows
-from mmsynth.scene.image_writers import write_png16
-from mmsynth.scene.scene import Frame, Sensor
+from mmsynth.scene.image_writers import write_png, write_png16
+from mmsynth.scene.images import load_frame
+from mmsynth.scene.scene import Frame, MaskMeaning, Sensor
 from mmsynth.sensors.camera import Camera
 
 
@@ -95,7 +96,7 @@ def test_pictures_and_embedded_light_are_those_of_the_field_and_the_frame(tmp_pa
         stored, ours, theirs = (
             spectra[name],
             field.render(frame.camera, frame.camera_to_world).channels[name],
-            measured_channels(sensor, frame),
+            measured_channels(sensor, frame, "off"),
         )
         assert stored["channels"] == list(sensor.channels) and stored["nm"] == list(sensor.wavelengths_nm) and stored["cell"] == [1.0, 1.0]
         step = (stored["high"] - stored["low"]) / 65534
@@ -180,7 +181,7 @@ def test_previews_of_a_mosaic_show_every_channel_in_its_place(tmp_path: Path, pa
     raw[6:10, 10:20] = 0.9
     write_png16(tmp_path / "0.png", raw)
     sensor = Sensor("rgb", tuple("RGBW"[:count]), (None,) * count, mosaic)
-    shown = measured_channels(sensor, Frame("rgb", 0, tmp_path / "0.png", Camera(30, 20, 20.0, 20.0, 15.0, 10.0), np.eye(4)))
+    shown = measured_channels(sensor, Frame("rgb", 0, tmp_path / "0.png", Camera(30, 20, 20.0, 20.0, 15.0, 10.0), np.eye(4)), "off")
     assert shown.shape == (20, 30, count)
     np.testing.assert_allclose(shown[1:4, 2:8], np.broadcast_to(levels, (3, 6, count)), atol=1e-4)
     if count == 3:
@@ -195,6 +196,24 @@ def test_previews_of_frames_with_alpha_show_what_is_scored(tmp_path: Path) -> No
     rgba[:10, :, 3] = 0.0
     cv2.imwrite(str(tmp_path / "0.png"), np.round(65535 * rgba[..., [2, 1, 0, 3]]).astype(np.uint16))
     frame = Frame("rgb", 0, tmp_path / "0.png", Camera(30, 20, 20.0, 20.0, 15.0, 10.0), np.eye(4))
-    shown = measured_channels(Sensor("rgb", ("R", "G", "B"), (None, None, None)), frame)
+    shown = measured_channels(Sensor("rgb", ("R", "G", "B"), (None, None, None)), frame, "off")
     np.testing.assert_allclose(shown, rgba[..., :3] * rgba[..., 3:], atol=2e-5)
     assert not shown[:10].any()
+
+
+@pytest.mark.parametrize(("masks", "black", "error"), [("object", True, 0.026), ("ignore", False, 0.0), ("off", False, 0.65)])
+def test_what_is_outside_of_a_mask_is_shown_as_it_is_scored(masks: MaskMeaning, black: bool, error: float, tmp_path: Path) -> None:
+    """Frames whose outside, two thirds of them, was painted white, by a field that has 0.04 there."""
+    sensor = Sensor("rgb", ("R", "G", "B"), (None, None, None))
+    field = AnalyticField(sphere(), [sensor])
+    scene = scene_of(field, tmp_path)
+    frames = []
+    for frame in scene.frames:
+        inside = field.render(frame.camera, frame.camera_to_world).opacity > 0.5
+        write_png16(frame.path, np.where(inside[..., None], load_frame(sensor, frame)[0], 1.0))
+        write_png(tmp_path / f"{frame.view}.png", inside.astype(np.uint8) * 255)
+        frames.append(replace(frame, mask=tmp_path / f"{frame.view}.png"))
+    _, (row, _) = picture_rows(field, replace(scene, frames=tuple(frames), masks=masks))  # type: ignore[arg-type]
+    shown, _, _, errors = row.each()
+    assert shown.caption == "frame 3" and (shown.image[0] < 10 if black else shown.image[0] > 200).all()
+    assert float(errors.caption.removeprefix("error, mean ")) == pytest.approx(error, abs=1e-3 + 0.1 * error)
