@@ -31,7 +31,7 @@ from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.signals import delayed_signals
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.trainer import Trainer
-from mmsynth.fitting.unseen import unmet_cells, unseen_before_cameras
+from mmsynth.fitting.unseen import solid_of, unmet_cells, unseen_before_cameras
 from mmsynth.prior.prediction import common, predict, scene_facts
 from mmsynth.prior.prior import Prior
 from mmsynth.scene.exposure import Exposure, stated_exposure
@@ -227,7 +227,7 @@ def _finished(trainer: Trainer) -> Field:
     surface, sharpness = field.surface.at(field.sampling.active_surface), field.sampling.sharpness
     field.occupancy.update(surface, sharpness, torch.Generator().manual_seed(0), 1.0)
     if field.design.background:
-        unseen = unseen_before_cameras(trainer.measurements.values(), len(field.occupancy.states))
+        unseen = unseen_before_cameras(trainer.measurements.values(), len(field.occupancy.states), solid_of(field))
         field.occupancy.empty(torch.from_numpy(unseen))
     elif trainer.has_opacity or trainer.needs.black_background:
         field.occupancy.empty(unmet_cells(field, trainer.measurements, np.random.default_rng((trainer.seed, 12))))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from mmsynth.fitting.measurements import Measurements, Modality, draw
 from mmsynth.fitting.stored_frames import in_threads
 from mmsynth.sensors.camera import Camera, project, unproject
 
+Solid = Callable[[np.ndarray], np.ndarray]  # points (N, 3) of the normalised frame → (N,) bool; called by several threads at once
 _AT_ONCE = 1 << 14  # cells
 _GROUPS = 8  # of views, for threads
 _RAYS, _RAYS_AT_ONCE = 1 << 17, 1 << 15  # that look for surfaces
@@ -51,12 +52,25 @@ def unmet_cells(field: Field, measurements: Measurements, random: np.random.Gene
     return (states < kernels.OUTSIDE) & ~near
 
 
-def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> np.ndarray:
+def solid_of(field: Field) -> Solid:
+    """Where a field is solid, as it is rendered; in torch, of whose kernels several may run at once."""
+    network = field.surface.at(field.sampling.active_surface)
+
+    @torch.no_grad()
+    def solid(points: np.ndarray) -> np.ndarray:
+        at = kernels.contract(torch.from_numpy(points.astype(np.float32)).to(field.device))
+        return kernels.reference.surface_value(at, *network).numpy(force=True) <= 0.0
+
+    return solid
+
+
+def unseen_before_cameras(modalities: Collection[Modality], resolution: int, solid: Solid) -> np.ndarray:
     """Cells of contracted space that are nearer to a training camera than its rays begin, and that no training picture sees whole.
 
     That rays begin there says that nothing is before; where other cameras see something all the same, they are right. But what nobody sees
-    is what the surface happens to be there, and a new view whose rays begin nearer would see it: a ghost. In the region of interest
-    are no such cells.
+    is what the surface happens to be there, and a new view whose rays begin nearer would see it: a ghost. Nor are those right whose rays
+    begin in something solid: at the border of their pictures, where no other camera looks, they painted on it what is far behind. In the
+    region of interest are no such cells.
 
     Args:
         resolution: cells along each axis of [-2, 2]³.
@@ -72,7 +86,7 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int) -> 
     before = in_threads(lambda i: _before_cameras(parts[i], resolution, origins, begins), len(parts))
     number, points, size = (np.concatenate(x) for x in zip(*before, strict=True))
     groups = min(_GROUPS, len(views))
-    seen = np.any(in_threads(lambda i: _seen_whole(points, size, views[i::groups]), groups), axis=0)
+    seen = np.any(in_threads(lambda i: _seen_whole(points, size, views[i::groups], solid), groups), axis=0)
     unseen = np.zeros(resolution**3, bool)
     unseen[number[~seen]] = True
     return unseen.reshape((resolution,) * 3)
@@ -95,8 +109,10 @@ def _before_cameras(number: np.ndarray, resolution: int, origins: np.ndarray, be
     return number[before], points[before], np.sqrt(3.0) * 2.0 / resolution * away[before, 0] ** 2
 
 
-def _seen_whole(points: np.ndarray, size: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray, float]]) -> np.ndarray:
-    """Which cells, by their centres (N, 3) and half diagonals (N,), are whole in a picture and beyond where its rays begin (N,).
+def _seen_whole(
+    points: np.ndarray, size: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray, float]], solid: Solid
+) -> np.ndarray:
+    """Which cells (N,), by centres (N, 3) and half diagonals (N,), are whole in a picture and beyond where its rays begin, in the open.
 
     Args:
         views: camera, rotation (3, 3) and origin (3,) of each, and where its rays begin.
@@ -112,7 +128,10 @@ def _seen_whole(points: np.ndarray, size: np.ndarray, views: Sequence[tuple[Came
         asked, local, away = asked[kept], local[kept], away[kept]
         pixels, margin = project(local, camera), max(camera.fx, camera.fy) * size[asked] / away
         last = np.array([camera.width, camera.height]) - 1.0
-        seen[asked] = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
+        whole = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
+        asked = asked[whole]
+        begins = origin + (points[asked] - origin) * (begin / away[whole])[:, None]
+        seen[asked] = ~solid(begins)
     return seen
 
 

@@ -16,6 +16,7 @@ from mmsynth.scene.motion import motion_to_matrix
 from mmsynth.sensors.camera import Camera, unproject
 
 GRID = 64
+nowhere = lambda points: np.zeros(len(points), bool)
 NARROW = Camera(64, 48, 200.0, 200.0, 31.5, 23.5)
 
 
@@ -47,7 +48,7 @@ def _along(stand: list[float], radii: float) -> tuple[np.ndarray, ...]:
 
 def test_cells_before_a_camera_are_unseen_unless_another_camera_sees_them() -> None:
     stands = [[0.0, 0.0, 3.0], [2.5, 0.0, -2.0]]
-    alone = unseen_before_cameras([_modality([NARROW] * 2, _looking_inwards(stands))], GRID)
+    alone = unseen_before_cameras([_modality([NARROW] * 2, _looking_inwards(stands))], GRID, nowhere)
     # rays of the first begin 1.6 before it, 1.4 from the centre
     assert alone[_along(stands[0], 2.0)].all() and alone[_along(stands[0], 1.7)].all()
     assert not alone[_along(stands[0], 1.2)].any() and not alone[_along([0.0, 1.0, 0.0], 2.0)].any()
@@ -55,11 +56,19 @@ def test_cells_before_a_camera_are_unseen_unless_another_camera_sees_them() -> N
     aside = _looking_inwards([*stands, [0.0, 6.0, 0.0]])
     aside[2, :3, 3] += [0.0, 0.0, 2.0]
     wide = Camera(64, 48, 100.0, 100.0, 31.5, 23.5)
-    seen = unseen_before_cameras([_modality([NARROW, NARROW, wide], aside)], GRID)
+    seen = unseen_before_cameras([_modality([NARROW, NARROW, wide], aside)], GRID, nowhere)
     assert not seen[_along(stands[0], 2.0)].any() and seen[_along(stands[1], 2.2)].all()
+    # but not if its rays begin in something solid, which is before them alone, or if they do on that side
+    begin = FREE * (np.linalg.norm(aside[2, :3, 3]) - 1.0)
+    before = lambda points: np.linalg.norm(points - aside[2, :3, 3], axis=1) < begin * 1.001
+    pictures = _modality([NARROW, NARROW, wide], aside)
+    painted = unseen_before_cameras([pictures], GRID, before)
+    assert painted[alone].all() and not seen[alone].all() and (seen <= painted).all()
+    half = unseen_before_cameras([pictures], GRID, lambda points: before(points) & (points[:, 2] > 1.8))
+    assert (seen <= half).all() and (half <= painted).all() and (seen < half).any() and (half < painted).any()
     # by a sensor of its own, as well
     both = [_modality([NARROW] * 2, aside[:2]), _modality([wide], aside[2:])]
-    assert np.array_equal(unseen_before_cameras(both, GRID), seen)
+    assert np.array_equal(unseen_before_cameras(both, GRID, nowhere), seen)
 
 
 @settings(max_examples=15, deadline=None)
@@ -70,7 +79,7 @@ def test_no_ray_of_a_picture_passes_unseen_cells(seed: int, count: int, fisheye:
     poses = motion_to_matrix(np.concatenate([random.normal(size=(count, 3)), random.normal(size=(count, 3)) * 2.0], 1))
     lens: dict = dict(distortion=(0.02, -0.01, 0.0, 0.0), lens="kannala_brandt") if fisheye else dict(distortion=(-0.2, 0.05, 0.001, 0.0))
     camera = Camera(96, 72, 60.0, 60.0, 47.0, 36.0, **lens)
-    unseen = unseen_before_cameras([_modality([camera] * count, poses)], GRID)
+    unseen = unseen_before_cameras([_modality([camera] * count, poses)], GRID, nowhere)
     axis = np.abs((np.arange(GRID) + 0.5) * (4.0 / GRID) - 2.0)
     assert not unseen[np.ix_(axis < 0.55, axis < 0.55, axis < 0.55)].any()
     for pose in poses:
@@ -90,8 +99,8 @@ def test_many_cameras_in_one_place_are_as_one() -> None:
     """All cells that count as unseen lie before a camera: nearer than where its rays begin."""
     stand = [0.0, 0.0, 2.2]
     poses = np.repeat(_looking_inwards([stand]), 5, axis=0)
-    unseen = unseen_before_cameras([_modality([NARROW] * 5, poses)], GRID)
-    assert np.array_equal(unseen, unseen_before_cameras([_modality([NARROW], poses[:1])], GRID)) and unseen.any()
+    unseen = unseen_before_cameras([_modality([NARROW] * 5, poses)], GRID, nowhere)
+    assert np.array_equal(unseen, unseen_before_cameras([_modality([NARROW], poses[:1])], GRID, nowhere)) and unseen.any()
     cells = (np.argwhere(unseen) + 0.5) * (4.0 / GRID) - 2.0
     r = np.linalg.norm(cells, axis=1, keepdims=True)
     away = np.linalg.norm(cells / r / (2.0 - r) - stand, axis=1)
