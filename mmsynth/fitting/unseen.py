@@ -75,7 +75,7 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int, sol
     region of interest are no such cells.
 
     Args:
-        resolution: cells along each axis of [-2, 2]³.
+        resolution: cells along each axis of [-2, 2]³. solid: where the field is, see ``solid_of``.
     Returns:
         (G, G, G) bool.
     """

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmsynth.field.kernels import contract
+from mmsynth.field.encoding import HashGrid
+from mmsynth.field.kernels import Sampling, contract
 from mmsynth.field.rendering import FREE, NEAR
+from mmsynth.field.surface import Surface
 from mmsynth.fitting.measurements import Modality
-from mmsynth.fitting.unseen import unseen_before_cameras
+from mmsynth.fitting.unseen import solid_of, unseen_before_cameras
 from mmsynth.scene.motion import motion_to_matrix
 from mmsynth.sensors.camera import Camera, unproject
 
@@ -105,3 +109,16 @@ def test_many_cameras_in_one_place_are_as_one() -> None:
     r = np.linalg.norm(cells, axis=1, keepdims=True)
     away = np.linalg.norm(cells / r / (2.0 - r) - stand, axis=1)
     assert (r > 1.0).all() and away.max() < FREE * 1.2 and away.max() == pytest.approx(FREE * 1.2, rel=0.05)
+
+
+def test_a_field_is_solid_in_its_spheres() -> None:
+    """Radius 0.5, and what is beyond 1.9 in contracted space: 10 radii."""
+    torch.manual_seed(0)
+    surface = Surface(HashGrid(2, 8, 4, 8, 2.0), 4, (0.5, 1.9))
+    field = SimpleNamespace(surface=surface, sampling=Sampling(400.0, 0.005, 2, 2), device="cpu")
+    random = np.random.default_rng(0)
+    radius = np.geomspace(0.05, 50.0, 5000)
+    aim = random.normal(size=(5000, 3))
+    found = solid_of(field)(aim / np.linalg.norm(aim, axis=1, keepdims=True) * radius[:, None])  # type: ignore[arg-type]
+    near = (np.abs(radius - 0.5) < 0.01) | (np.abs(radius - 10.0) < 0.5)
+    assert np.array_equal(found[~near], ((radius < 0.5) | (radius > 10.0))[~near])
