@@ -28,9 +28,9 @@ def _without_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "_backend", lambda tensor: reference)
 
 
-def _trainer() -> Trainer:
+def _trainer(recipe: Recipe = SMALL) -> Trainer:
     """Of the example: five sensors, polarization among them."""
-    return Trainer(load_scene(data_folder("example_scene")), SMALL, steps=100, budget=None, seed=0, device="cpu")
+    return Trainer(load_scene(data_folder("example_scene")), recipe, steps=100, budget=None, seed=0, device="cpu")
 
 
 @needs_triton

@@ -18,12 +18,15 @@ from mmsynth.fitting.schedule import SurfaceRates, sampling_at
 from mmsynth.fitting.trainer import Trainer
 from mmsynth.scene.load import load_scene
 
+# an operation of the interpreter takes as long for one number as for a block
+FEW = {"surface.levels": 2, "radiance.levels": 2, "loss.eikonal_points": 16, "sampling.initial_rays": 8, "sampling.occupancy_resolution": 8}
+
 
 def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if device != "cpu":
         pytest.skip("a fit on a GPU does it")
     monkeypatch.setattr(kernels, "_backend", lambda tensor: reference)
-    trainer = test_device_step._trainer()
+    trainer = test_device_step._trainer(test_device_step.SMALL.with_changes(FEW))
     field, light = trainer.field, trainer.field.light
     assert light is not None
     light.add(torch.tensor([[1.5, 2.0, -1.0], [-2.0, 0.5, 1.5]]))
@@ -31,7 +34,7 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
         field, trainer.measurements, trainer.importance, trainer.optimiser, trainer.log_gain, trainer.needs, trainer.recipe, 0
     )
     sampling = sampling_at(0.1, trainer.recipe, trainer.needs)
-    stage = step.stage(sampling, 20, decided=True, gains=True, early=True, outside=4)
+    stage = step.stage(sampling, 10, decided=True, gains=True, early=True, outside=4)
     before, table = step.flat.values.clone(), field.surface.grid.table.detach().clone()
     for number in (0, 1):  # the last layer of the surface begins with zeros: the hidden one moves with the second step
         step.run(stage, sampling, number, 1.0, SurfaceRates(0.5, 0.75))
@@ -68,7 +71,7 @@ def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
     monkeypatch.setattr(DeviceStep, "samples", 256)
     monkeypatch.setattr(DeviceStep, "first_rays", 8)
     scene = load_scene(write_scene(tmp_path, {"rgb": around(4), "nir": around(4)}))
-    recipe = QUICK.with_changes({"radiance.exposure": "on", "radiance.light": "off", "poses.views": "on", "sampling.initial_rays": 8})
+    recipe = QUICK.with_changes({"radiance.exposure": "on", "radiance.light": "off", "poses.views": "on", **FEW})
     begin = lambda: Trainer(scene, recipe, steps=4, budget=None, seed=0, device="cuda")
     with pretended_gpu():
         whole = begin()
@@ -98,7 +101,7 @@ def test_arrays_that_graphs_hold_stay_or_the_graphs_go(device: str, tmp_path: Pa
     monkeypatch.setattr(DeviceStep, "samples", 256)
     monkeypatch.setattr(DeviceStep, "first_rays", 8)
     scene = load_scene(write_scene(tmp_path, {"rgb": around(4)}))
-    recipe = QUICK.with_changes({"schedule.tables_at": 0.011, "sampling.initial_rays": 8})
+    recipe = QUICK.with_changes({"schedule.tables_at": 0.011, **FEW})
     with pretended_gpu() as gpu:
         trainer = Trainer(scene, recipe, steps=200, budget=None, seed=0, device="cuda")
         step, table = trainer.on_device, trainer.field.surface.grid.table
