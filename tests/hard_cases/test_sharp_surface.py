@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from small_scenes import QUICK, RADIUS, around, write_scene
 
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import Rays, Sampling, reference
@@ -13,6 +16,8 @@ from mmsynth.field.surface import Surface
 from mmsynth.fitting.optimiser import Adam
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.schedule import surface_rates
+from mmsynth.fitting.trainer import Trainer
+from mmsynth.scene.load import load_scene
 
 OF_ROWS = 1.2e-6  # median of the root mean square of the gradients of a table's rows, measured in fits of photographs
 
@@ -76,6 +81,32 @@ def test_what_few_rays_tell_a_table_moves_it_by_less(row: Callable[[str, str, st
         "gradients of a table's rows a twentieth as large as usual, all of it noise",
         f"Adam without an epsilon: the surface trembles by {usual:.2g} of its softness",
         f"{ours:.2g}",
+    )
+
+
+def test_a_sharp_surface_does_not_go_to_and_fro_as_a_whole(row: Callable[[str, str, str], None], tmp_path: Path) -> None:
+    """A step of the network moves all of it at once: at full rate it passes its place by, again and again."""
+    scene = load_scene(write_scene(tmp_path / "scene", {"rgb": around(12)}, size=(32, 24)))
+    on_ball = torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=-1).numpy() * RADIUS
+    off = {"schedule.sharpness_per_footprint": 32.0, "radiance.light": "off", "poses.views": "off"}
+
+    def swing(full_rate_sharpness: float, seed: int) -> tuple[float, float]:
+        """How far the surface as a whole has gone over the last third of a fit, in widths of the soft surface; and its sharpness."""
+        recipe = QUICK.with_changes({**off, "schedule.full_rate_sharpness": full_rate_sharpness})
+        trainer, places = Trainer(scene, recipe, steps=400, budget=None, seed=seed, device="cpu"), []
+        while trainer.progress < 1.0:
+            trainer.run_step()
+            if trainer.progress > 0.7:
+                places.append(float(trainer.field.sdf(on_ball).mean()))
+        soft = 3.5 * trainer.field.region.radius / trainer.needs.sharpness_end
+        return float(np.ptp(places)) / soft, trainer.needs.sharpness_end
+
+    usual, ours = (np.array([swing(sharpness, seed) for seed in (0, 2)]).T for sharpness in (1e9, Recipe().schedule.full_rate_sharpness))
+    assert ours[0].max() < 1.5 and usual[0].min() > 2.5
+    row(
+        f"a fit of a surface of sharpness {ours[1, 0]:.0f}",
+        f"its network at full rate: all of it goes to and fro over {usual[0].min():.1f} to {usual[0].max():.1f} of its softness",
+        f"{ours[0].min():.1f} to {ours[0].max():.1f}",
     )
 
 
