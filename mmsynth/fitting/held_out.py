@@ -1,7 +1,7 @@
 """Views that are not learned from while directions are on trial.
 
 What a fit has learned of a view says little of the views between: appearance can hold a colour for each camera. So every eighth view is
-held out from when radiance first depends on direction until it is decided how far it does, which these views judge.
+held out from when radiance first depends on direction until it is decided how far it does. These views judge that, and lamps before.
 """
 
 from __future__ import annotations

@@ -235,7 +235,7 @@ class Trainer:
             state.light_looks += 1
             dark = not field.shines
         if state.light is None and (dark or self.progress >= schedule.light_until):
-            state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed)
+            state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed, held)
             self._mirror(state.light)
             look_for_lamps(field, self.measurements, sampling, self.seed)
         if state.decided is None:

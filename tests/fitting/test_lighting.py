@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from mmsynth.field.storage import load_field
+from mmsynth.fitting import lighting
+from mmsynth.fitting.candidates import Look
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -110,8 +112,29 @@ def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
         light.second.weight[1:4] = 0.0
         light.second.bias[1:4] = -200.0
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto", "light_min_improvement": 1e-6})
-    choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0)
+    choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0, None)
     assert not choice.value and "save 0.0%" in choice.why
+
+
+def test_views_that_are_held_out_judge_lamps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial of the packaged scene: the copies of the shader learn from the other views."""
+    scene = load_scene(data_folder("example_scene"), modalities=["rgb"])
+    trainer, looks = Trainer(scene, SMALL.with_changes({"radiance.light": "on"}), 40, None, 0, "cpu"), list[Look]()
+
+    def spied(*args: Any) -> Look:
+        looks.append(look(*args))
+        return looks[-1]
+
+    look = lighting.look
+    while trainer.state.light is None:
+        looks.clear()
+        with monkeypatch.context() as patched:
+            patched.setattr(lighting, "look", spied)
+            trainer.run_step()
+    rgb = trainer.measurements["rgb"]
+    learned, judged = (set(rgb.views[seen.batch.frame.numpy()].tolist()) for seen in looks[:2])
+    held = set(np.unique(rgb.views)[4::8].tolist())
+    assert judged == held and learned == set(rgb.views.tolist()) - held
 
 
 def test_a_lamp_of_which_nothing_is_seen_is_given_up(scene: Scene) -> None:
