@@ -21,7 +21,7 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from torch.overrides import TorchFunctionMode
 
 from mmsynth.bench.launches import READS
-from mmsynth.fitting import candidates, decisions, lighting, measurements, needs, refinement, table_sizes
+from mmsynth.fitting import candidates, decisions, lighting, measurements, needs, refinement, table_sizes, unseen
 from mmsynth.fitting.graphs import Repeated
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
@@ -216,5 +216,6 @@ def few_looks(monkeypatch: pytest.MonkeyPatch, rays: int = 64) -> None:
         (candidates, "_STEPS", 2), (decisions, "_RAYS", rays), (lighting, "_RAYS", rays), (measurements, "_TYPICAL", 1024),
         (needs, "_LOOKED_AT", 256), (refinement, "_AT_ONCE", rays), (refinement, "_DECIDE", 2), (refinement, "_PER_STEP", 2 * rays),
         (refinement, "_PER_VIEW", 1), (table_sizes, "_PROBES", 8 * rays),
+        (unseen, "_RAYS", 64 * rays), (unseen, "_RAYS_AT_ONCE", 16 * rays),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, number)
