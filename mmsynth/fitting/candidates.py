@@ -17,6 +17,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
+from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.optimiser import Adam
 
@@ -51,6 +52,14 @@ def look(
     batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, selection)
     hits = field.trace(batch.origins, batch.directions, sampling)
     return Look(batch, hits, field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface))
+
+
+def look_twice(
+    field: Field, measurements: Measurements, rays: int, sampling: kernels.Sampling, random: np.random.Generator, held: Tensor | None
+) -> tuple[Look, Look]:
+    """What copies learn from, half as many rays, and what judges them; ``held``: tiles that judge and are not learned from."""
+    learned, judged = selections(measurements, held)
+    return look(field, measurements, rays // 2, sampling, random, learned), look(field, measurements, rays, sampling, random, judged)
 
 
 def squared_errors(shader: Shader, learned: Look, judged: Look, degree: int, mirrors: bool = True) -> Tensor:

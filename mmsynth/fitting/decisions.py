@@ -16,9 +16,8 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.candidates import Look, look, squared_errors
+from mmsynth.fitting.candidates import Look, look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
-from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import RadianceRecipe
 
@@ -46,8 +45,7 @@ def decide(
     random = np.random.default_rng((seed, 2))
     judged = look(field, measurements, _RAYS, sampling, random)
     if recipe.view_dependence == "auto":
-        sides = zip((_RAYS // 2, _RAYS), selections(measurements, held), strict=True)
-        errors = errors_by_degree(field.shader, *(look(field, measurements, rays, sampling, random, some) for rays, some in sides))
+        errors = errors_by_degree(field.shader, *look_twice(field, measurements, _RAYS, sampling, random, held))
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         asked = recipe.view_dependence

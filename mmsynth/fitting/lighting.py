@@ -11,10 +11,9 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.fitting.candidates import look, squared_errors
+from mmsynth.fitting.candidates import look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.decisions import DEGREES
-from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.recipe import RadianceRecipe
 
@@ -86,16 +85,15 @@ def decide_light(
 ) -> Choice[bool]:
     """Whether the lamps of a field that has learned with them are worth it.
 
-    Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``. ``held``: tiles that were not
-    learned from since there are lamps, which judge.
+    Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``. ``held``: tiles of the
+    views that judge, see ``held_out``.
     """
     if recipe.light == "off":
         return switch(False, "asked for by the recipe")
     if not field.shines:
         return switch(False, "from no direction surfaces are brighter than from others")
     random = np.random.default_rng((seed, 10))
-    sides = zip((_RAYS // 2, _RAYS), selections(measurements, held), strict=True)
-    learned, judged = (look(field, measurements, rays, sampling, random, some) for rays, some in sides)
+    learned, judged = look_twice(field, measurements, _RAYS, sampling, random, held)
     relative = judged.batch.measured.level.square()[judged.usable]
     lit, unlit = (squared_errors(field.shader, learned, judged, DEGREES, mirrors)[judged.usable] / relative for mirrors in (True, False))
     whole = float(unlit.mean())

@@ -19,7 +19,7 @@ from mmsynth.fitting.trainer import Trainer
 from mmsynth.scene.load import load_scene
 
 # an operation of the interpreter takes as long for one number as for a block
-FEW = {"surface.levels": 2, "radiance.levels": 2, "loss.eikonal_points": 16, "sampling.initial_rays": 8, "sampling.occupancy_resolution": 8}
+FEW = {"surface.levels": 3, "radiance.levels": 3, "loss.eikonal_points": 16, "sampling.initial_rays": 8, "sampling.occupancy_resolution": 8}
 
 
 def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
