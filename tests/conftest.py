@@ -8,12 +8,14 @@ import signal
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
 import torch
+from few_looks import few_looks
 
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import PosedCamera
@@ -113,6 +115,12 @@ def write_transforms(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
+@pytest.fixture
+def decided_by_few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a fit in a test of something else."""
+    few_looks(monkeypatch)
+
+
 # --- the table of hard cases: pytest tests/hard_cases --hard-cases FILE
 
 _ROWS = pytest.StashKey[list[tuple[str, str, str, str]]]()
@@ -146,13 +154,23 @@ if INTERPRETED:
     # the interpreter of triton 3.6 takes int() of arrays of one element for the bounds of a loop; numpy 2.4 has no such thing
     from triton.runtime import interpreter
 
-    patch_tensor = interpreter._patch_lang_tensor
+    patch_tensor, patch_language = interpreter._patch_lang_tensor, interpreter._patch_lang
 
     def patch_tensor_and_index(tensor: object, scope: interpreter._LangPatchScope) -> None:
         patch_tensor(tensor, scope)
         scope.set_attr(tensor, "__index__", lambda self: int(self.handle.data.item()))
 
+    patched: set[str] = set()
+
+    def patch_once(function: FunctionType) -> object:
+        """Functions look for what to patch each time one is called, a fifth of the time; nobody here needs the language as it was."""
+        if function.__module__ not in patched:
+            patched.add(function.__module__)
+            patch_language(function)
+        return interpreter._LangPatchScope()  # has nothing to restore
+
     interpreter._patch_lang_tensor = patch_tensor_and_index
+    interpreter._patch_lang = patch_once
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -14,14 +14,12 @@ from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
-import pytest
 import torch
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.overrides import TorchFunctionMode
 
 from mmsynth.bench.launches import READS
-from mmsynth.fitting import candidates, decisions, lighting, measurements, needs, refinement, table_sizes, unseen
 from mmsynth.fitting.graphs import Repeated
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
@@ -208,14 +206,3 @@ def pretended_gpu() -> Iterator[PretendedGpu]:
             stack.enter_context(mock.patch.object(InterpretedFunction, "run", noted(InterpretedFunction.run)))
         stack.enter_context(gpu)
         yield gpu
-
-
-def few_looks(monkeypatch: pytest.MonkeyPatch, rays: int = 64) -> None:
-    """A fit decides by so many rays at a time: by as many as usual it takes minutes of what a GPU does at once."""
-    for module, name, number in (
-        (candidates, "_STEPS", 2), (decisions, "_RAYS", rays), (lighting, "_RAYS", rays), (measurements, "_TYPICAL", 1024),
-        (needs, "_LOOKED_AT", 256), (refinement, "_AT_ONCE", rays), (refinement, "_DECIDE", 2), (refinement, "_PER_STEP", 2 * rays),
-        (refinement, "_PER_VIEW", 1), (table_sizes, "_PROBES", 8 * rays),
-        (unseen, "_RAYS", 64 * rays), (unseen, "_RAYS_AT_ONCE", 16 * rays),
-    ):  # fmt: skip
-        monkeypatch.setattr(module, name, number)

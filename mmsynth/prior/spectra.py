@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from mmsynth.prior.samples import SceneSamples, columns_of
@@ -337,6 +336,8 @@ def _clusters(reflected: np.ndarray, has: np.ndarray, count: int, random: np.ran
     if len(chroma) >= _LEAST_PIXELS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # fewer colours than clusters: some are empty
+            from scipy.cluster.vq import kmeans2  # a quarter of a second to import
+
             _, label = kmeans2(place, min(count, len(chroma) // _LEAST_PIXELS), minit="++", rng=random)
         for k in np.unique(label):
             of = label == k

@@ -24,6 +24,8 @@ from mmsynth.operations.output.work_partition import WorkPartition
 from mmsynth.packaged import data_folder
 from mmsynth.scene.image_writers import write_png
 
+pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
+
 EXAMPLE = data_folder("example_scene")
 FIVE = ("rgb", "nir", "mono", "pol", "ms")
 

@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 
 from mmsynth.cli import app
 
+pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
+
 
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

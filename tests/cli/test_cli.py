@@ -17,6 +17,8 @@ from mmsynth.cli import app
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 
+pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from few_looks import few_looks
 from small_scenes import QUICK, around, write_scene
 
 from mmsynth.errors import InputError, Interrupted, OutOfMemoryError
@@ -23,6 +24,8 @@ from mmsynth.fitting.run import fit
 from mmsynth.fitting.trainer import Trainer
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Scene
+
+pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
 
 Row = Callable[[str, str, str], None]
 STEPS = 6
@@ -41,7 +44,9 @@ def scene(folder: Path) -> Scene:
 @pytest.fixture(scope="module")
 def whole(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("whole")
-    fit(scene, run, recipe=QUICK, steps=STEPS)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        few_looks(monkeypatch)
+        fit(scene, run, recipe=QUICK, steps=STEPS)
     return run
 
 

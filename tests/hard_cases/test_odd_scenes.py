@@ -106,6 +106,7 @@ ARRANGEMENTS: dict[str, tuple[list[np.ndarray], Callable[[list[np.ndarray]], str
 }
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("name", ARRANGEMENTS)
 def test_cameras_in_odd_places(row: Row, tmp_path: Path, name: str) -> None:
     cameras, usual = ARRANGEMENTS[name]
@@ -210,6 +211,7 @@ def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("size", [(32, 1), (1, 24), (1, 1)])
 def test_pictures_of_one_row_or_column_or_pixel(row: Row, tmp_path: Path, size: tuple[int, int]) -> None:
     _fit(tmp_path, {"rgb": around(6)}, size=size)
@@ -256,6 +258,7 @@ def test_scenes_in_any_unit(row: Row, tmp_path: Path, scale: float) -> None:
     )
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("steps", [1, 2, 19])
 def test_the_shortest_fits(row: Row, tmp_path: Path, steps: int) -> None:
     _fit(tmp_path, {"rgb": around(6)}, steps=steps)
@@ -384,6 +387,7 @@ def _atomic_sums(orders: int) -> float:
     return float((torch.stack(sums) != sums[0]).any(0).float().mean())
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_same_fit_twice(row: Row, tmp_path: Path, threads: int) -> None:
     before = torch.get_num_threads()

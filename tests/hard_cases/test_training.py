@@ -59,6 +59,7 @@ def _unchecked_step(trainer: Trainer) -> tuple[float, float]:
     return lost[0], lost[1]
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_one_bad_pixel_spoils_one_step(row: Row, scene: Scene) -> None:
     """A value that turned NaN in memory: steps that meet it change nothing, all others go on."""
     trainer = _trainer(scene)
@@ -129,6 +130,7 @@ def _resumed_from_parameters(scene: Scene, recipe: Recipe, at: int) -> float:
     return float((whole.field.surface(points, 3) - resumed.field.surface(points, 3)).detach().abs().mean())
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_killed_fit_goes_on_as_if_it_had_not_been(row: Row, scene: Scene, tmp_path: Path) -> None:
     """Killed where levels open, tables are sized, directions are decided."""
     recipe = QUICK.with_changes({"poses.views": "on"})

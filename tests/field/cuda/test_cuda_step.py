@@ -8,7 +8,8 @@ import torch
 
 sys.path += [str(Path(__file__).parents[2] / folder) for folder in ("fitting", "hard_cases")]
 import test_device_step
-from pretended_gpu import few_looks, pretended_gpu
+from few_looks import few_looks
+from pretended_gpu import pretended_gpu
 from small_scenes import QUICK, around, write_scene
 
 from mmsynth.field import kernels
