@@ -328,6 +328,8 @@ def _line(log: np.ndarray) -> np.ndarray:
 
 def _clusters(reflected: np.ndarray, has: np.ndarray, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means, variances (K, C) and shares (K,) of clusters by chromaticity of (N, C); bright pixels weigh more, as their noise is less."""
+    from scipy.cluster.vq import kmeans2  # a quarter of a second to import
+
     level = np.nanmean(reflected, 1)
     chosen = level > _DARK
     chroma, weight = reflected[chosen] / level[chosen, None], level[chosen] ** 2
@@ -336,8 +338,6 @@ def _clusters(reflected: np.ndarray, has: np.ndarray, count: int, random: np.ran
     if len(chroma) >= _LEAST_PIXELS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # fewer colours than clusters: some are empty
-            from scipy.cluster.vq import kmeans2  # a quarter of a second to import
-
             _, label = kmeans2(place, min(count, len(chroma) // _LEAST_PIXELS), minit="++", rng=random)
         for k in np.unique(label):
             of = label == k
