@@ -6,6 +6,7 @@ import functools
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -23,47 +24,75 @@ from mmsynth.scene.scene import Sensor
 def warm_up() -> None:
     """Compile the CPU kernels of a fit if they never were, and say so, and load them, so that no timed loop does it.
 
-    A process of its own compiles: in the one that did, kernels share code that was compiled for others, and its sums are rounded otherwise
-    than in every later process, which loads the kernels from the cache. Where there is no cache, this process has to compile.
+    Processes of their own compile, half of the kernels each: in the one that did, kernels share code that was compiled for others, and its
+    sums are rounded otherwise than in every later process, which loads the kernels from the cache. Where there is no cache, this process
+    has to compile.
     """
     if not cpu.is_compiled():
-        print("compiling kernels once, one to three minutes ...", file=sys.stderr, flush=True)
-        command = [sys.executable, "-c", "from mmsynth.field.warmup import run_kernels; run_kernels()"]
-        subprocess.run(command, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True)
+        print("compiling kernels once, one to two minutes ...", file=sys.stderr, flush=True)
+        _in_processes(_HALVES)
         cpu.remove_old_kernels()
-    run_kernels()
+    for half in _HALVES:
+        half()
 
 
-def run_kernels() -> None:
-    """Call each kernel of a fit: a tiny fit."""
+def _in_processes(calls: Sequence[Callable[[], None]]) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    commands = [[sys.executable, "-c", f"from mmsynth.field import warmup; warmup.{call.__name__}()"] for call in calls]
+    children = [subprocess.Popen(c, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
+    try:
+        for child in children:
+            child.wait()
+    finally:  # what is interrupted compiles no more
+        for child in children:
+            child.kill()
+
+
+def _small() -> tuple[Surface, HashGrid, kernels.ShaderWeights, kernels.Measured]:
+    """Of a tiny fit: surface, appearance, the shader's weights and a measured number of one ray."""
+    surface, appearance = Surface(HashGrid(1, 8, 4, 4), 4, (0.5, 4.0)), HashGrid(1, 8, 4, 4)
+    weights = Shader(4, 4, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}).weights()
+    one, index = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+    return surface, appearance, weights, kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one)
+
+
+def run_operations() -> None:
+    """Call each kernel that renders, with gradients."""
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
-        surface, appearance = Surface(HashGrid(1, 8, 4, 4), 4, (0.5, 4.0)), HashGrid(1, 8, 4, 4)
+        surface, appearance, weights, measured = _small()
         origins, directions = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True), torch.tensor([[0.0, 0.0, 1.0]])
         hits = trace(surface, appearance, Occupancy(4), origins, directions, torch.zeros(1), kernels.Sampling(20.0, 0.1, 1, 1))
-        weights = Shader(4, 4, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}).weights()
-        one, index = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+        index = torch.zeros(1, dtype=torch.int64)
         rays = kernels.ShadedRays(hits.features, hits.share, hits.behind, directions, index, index == 0)
-        measured = kernels.Measured(one, index, index, torch.empty(0, 3), one, one, one)
         loss, _ = kernels.compare(weights, rays, measured)
         lamps, share = kernels.Lamps(torch.ones(1, 3, requires_grad=True), torch.ones(1, 1)), hits.share.detach()
         mirrors = kernels.Mirrors(torch.zeros(1, 6), directions, directions, directions, share)
         loss = loss + kernels.mirror(lamps, mirrors, hits.behind, measured).sum()
         (loss + surface(origins.detach(), 1).sum()).backward()
-        none = torch.empty(0)
-        rays_of_step = kernels.Rays(origins.detach(), directions, one, 3.0 * one, one - 1.0)
-        step = kernels.Step(
-            *surface.at(1), appearance.at(1), Occupancy(4).states, weights, kernels.no_light("cpu"), none, rays_of_step,
-            kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none, none, 0.05),
-            kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
-        )  # fmt: skip
-        kernels.learn(kernels.arrange(step))
     with torch.no_grad():
         kernels.classify(Occupancy(4).states, kernels.Cells(1.0, 1, 0, 0.1, 2.0), *surface.at(1))
         kernels.shade(weights, hits.features, directions, 0)
         kernels.reflect(lamps.position, mirrors)
+
+
+def run_steps() -> None:
+    """Call each kernel of a step: a tiny fit."""
+    with torch.random.fork_rng(devices=[]), torch.enable_grad():
+        surface, appearance, weights, measured = _small()
+        none, one, index = torch.empty(0), torch.ones(1), torch.zeros(1, dtype=torch.int64)
+        rays = kernels.Rays(torch.tensor([[0.0, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]]), one, 3.0 * one, one - 1.0)
+        step = kernels.Step(
+            *surface.at(1), appearance.at(1), Occupancy(4).states, weights, kernels.no_light("cpu"), none, rays,
+            kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none, none, 0.05),
+            kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
+        )  # fmt: skip
+        kernels.learn(kernels.arrange(step))
     _draw()
     parameter, gradient, first, second = torch.zeros(4, 1)
     kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
+
+
+_HALVES = (run_steps, run_operations)  # of about as much to compile
 
 
 def _draw() -> None:

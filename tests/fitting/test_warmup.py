@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from mmsynth.errors import Interrupted
 from mmsynth.field import warmup
 from mmsynth.field.kernels import cpu
 from mmsynth.field.kernels.cpu import (
@@ -45,14 +47,31 @@ def test_a_fit_compiles_nothing_after_it_began(tmp_path: Path) -> None:
     assert _signatures() == before
 
 
-def test_another_process_compiles_and_this_one_loads(monkeypatch: pytest.MonkeyPatch) -> None:
+class _Child:
+    """In the place of a process: what was started, waited for and killed."""
+
+    def __init__(self, log: list[str], command: list[str], wait: Callable[[], None]) -> None:
+        self.log, self.what, self._wait = log, command[-1].split(".")[-1], wait
+        assert command[0] == sys.executable
+        log.append(f"start {self.what}")
+
+    def wait(self) -> None:
+        self.log.append(f"wait {self.what}")
+        self._wait()
+
+    def kill(self) -> None:
+        self.log.append(f"kill {self.what}")
+
+
+def test_other_processes_compile_and_this_one_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a first fit would round otherwise than all later ones."""
-    started: list[list[str]] = []
+    log: list[str] = []
     with monkeypatch.context() as patch:
         patch.setattr(cpu, "is_compiled", lambda: False)
-        patch.setattr(warmup.subprocess, "run", lambda command, **_: started.append(command))
+        patch.setattr(warmup.subprocess, "Popen", lambda command, **_: _Child(log, command, lambda: None))
         warmup.warm_up.__wrapped__()
-    assert [command[0] for command in started] == [sys.executable] and "run_kernels()" in started[0][-1]
+    halves = ["run_steps()", "run_operations()"]
+    assert log == [f"{what} {half}" for what in ("start", "wait", "kill") for half in halves]
     program = (
         "from mmsynth.field.warmup import warm_up; warm_up()\n"
         "from mmsynth.field.kernels import cpu\n"
@@ -60,3 +79,16 @@ def test_another_process_compiles_and_this_one_loads(monkeypatch: pytest.MonkeyP
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert run.stdout == f"{[(1, 0)] * len(cpu.KERNELS)}\n", run.stderr
+
+
+def test_what_is_interrupted_compiles_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    log: list[str] = []
+
+    def interrupted() -> None:
+        raise Interrupted("stop")
+
+    monkeypatch.setattr(cpu, "is_compiled", lambda: False)
+    monkeypatch.setattr(warmup.subprocess, "Popen", lambda command, **_: _Child(log, command, interrupted))
+    with pytest.raises(Interrupted):
+        warmup.warm_up.__wrapped__()
+    assert log[-2:] == ["kill run_steps()", "kill run_operations()"]
