@@ -12,9 +12,10 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import expit, log_ndtr
+from scipy.special import log_ndtr
 
 QUANTISATION = 1.0 / 12.0
+_AT_ONCE = 1 << 14  # values: what is made of them stays in the cache
 
 Name = Literal["constant", "slope", "square", "variation", "outliers"]
 
@@ -87,7 +88,7 @@ class Values:
     region: np.ndarray
     frame: np.ndarray
 
-    def __getitem__(self, chosen: np.ndarray) -> Values:
+    def __getitem__(self, chosen: np.ndarray | slice) -> Values:
         return Values(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
 
@@ -116,8 +117,9 @@ def _log_likelihood(p: Parameters, d: Values, factor: int, wide: OutlierVariance
     narrow, narrow_slope = _log_density(d, variance)
     broad, broad_slope = _log_density(d, wide.times * variance + wide.plus)
     odds = broad - narrow + (np.log(unexpected) - np.log1p(-unexpected))  # logarithm, of an outlier
-    likelihood = narrow + np.log1p(-unexpected) + np.logaddexp(0.0, odds)
-    of_broad = expit(odds)
+    less = np.exp(-np.abs(odds))
+    likelihood = narrow + np.log1p(-unexpected) + np.maximum(odds, 0.0) + np.log1p(less)
+    of_broad = np.where(odds > 0.0, 1.0, less) / (1.0 + less)
     by_variance = narrow_slope + of_broad * (wide.times * broad_slope - narrow_slope)
     return likelihood, by_variance, of_broad - unexpected, terms
 
@@ -138,9 +140,16 @@ def most_likely(start: Parameters, d: Values, factor: int, free: Sequence[Name],
     chosen = [_NAMES.index(name) for name in free]
     with_free = lambda x: replace(start, **dict(zip(free, x, strict=True)))
 
+    count = len(d.value)
+    parts = [d[slice(begin, begin + _AT_ONCE)] for begin in range(0, count, _AT_ONCE)]
+
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, by_variance, by_outliers, terms = _log_likelihood(with_free(x), d, factor, wide)
-        return -float(value.mean()), -np.append(terms @ by_variance, by_outliers.sum())[chosen] / len(value)
+        p, total, slopes = with_free(x), 0.0, np.zeros(5)
+        for part in parts:
+            value, by_variance, by_outliers, terms = _log_likelihood(p, part, factor, wide)
+            total += float(value.sum())
+            slopes += np.append(terms @ by_variance, by_outliers.sum())
+        return -total / count, -slopes[chosen] / count
 
     first, low, high = (np.array(astuple(p))[chosen] for p in (start, _LOW, _HIGH))
     options = {"ftol": 1e-12, "gtol": 1e-8}
