@@ -6,7 +6,9 @@ import functools
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import torch
 
@@ -30,22 +32,30 @@ def warm_up() -> None:
     """
     if not cpu.is_compiled():
         print("compiling kernels once, one to two minutes ...", file=sys.stderr, flush=True)
-        _in_processes(_HALVES)
+        _compile_apart(_HALVES)
         cpu.remove_old_kernels()
     for half in _HALVES:
         half()
 
 
-def _in_processes(calls: Sequence[Callable[[], None]]) -> None:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    commands = [[sys.executable, "-c", f"from mmsynth.field import warmup; warmup.{call.__name__}()"] for call in calls]
-    children = [subprocess.Popen(c, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for c in commands]
-    try:
-        for child in children:
-            child.wait()
-    finally:  # what is interrupted compiles no more
-        for child in children:
-            child.kill()
+def _compile_apart(calls: Sequence[Callable[[], None]]) -> None:
+    """Each in a process and with a cache of its own, whose kernels are kept when all are done."""
+    with tempfile.TemporaryDirectory(prefix="mmsynth-kernels-", ignore_cleanup_errors=True) as folder:
+        caches = [Path(folder) / call.__name__ for call in calls]
+        children: list[subprocess.Popen[bytes]] = []
+        try:
+            for call, cache in zip(calls, caches, strict=True):
+                command = [sys.executable, "-c", f"from mmsynth.field import warmup; warmup.{call.__name__}()"]
+                environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(cache)}
+                children.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+            for child in children:
+                child.wait()
+        finally:  # what is interrupted compiles no more
+            for child in children:
+                child.kill()
+                child.wait()
+        for cache in caches:
+            cpu.keep_compiled(cache)
 
 
 def _small() -> tuple[Surface, HashGrid, kernels.ShaderWeights, kernels.Measured]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -55,3 +57,26 @@ def test_the_last_versions_are_kept(tmp_path: Path) -> None:
 def test_the_kernels_are_kept_by_version() -> None:
     version = caching.version_of_sources(Path(caching.__file__).parent)
     assert all(Path(kernel._cache._cache_path).parent.name == f"kernels-{version}" for kernel in KERNELS)
+
+
+def test_what_was_compiled_apart_is_put_where_it_is_looked_for(tmp_path: Path) -> None:
+    """A program that numba compiles with a cache of its own; another one finds its code, and no other function's."""
+    (tmp_path / "program.py").write_text(
+        "import sys; from pathlib import Path; from numba import njit\n"
+        "@njit(cache=True)\ndef inner(x): return x + 1\n"
+        "@njit(cache=True)\ndef outer(x): return inner(x) + 1\n"
+        "print(outer(1), sum(outer.stats.cache_hits.values()), outer._cache._cache_path, Path(outer._cache._cache_file._index_name).stem)\n"
+    )
+
+    def result(cache: str) -> list[str]:
+        variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / cache)}
+        run = subprocess.run([sys.executable, str(tmp_path / "program.py")], env=variables, capture_output=True, text=True, check=True)
+        return run.stdout.split()
+
+    *told, made, name = result("own")
+    assert told == ["3", "0"]
+    kept = tmp_path / "kept" / Path(made).name
+    caching.publish(Path(made), kept, name)
+    caching.publish(Path(made), kept, "nothing")
+    assert {path.name for path in kept.iterdir()} == {f"{name}.nbi", f"{name}.1.nbc"}
+    assert result("kept")[:2] == ["3", "1"]

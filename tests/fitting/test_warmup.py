@@ -65,13 +65,16 @@ class _Child:
 
 def test_other_processes_compile_and_this_one_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a first fit would round otherwise than all later ones."""
-    log: list[str] = []
+    log, caches = list[str](), set[str]()
     with monkeypatch.context() as patch:
         patch.setattr(cpu, "is_compiled", lambda: False)
-        patch.setattr(warmup.subprocess, "Popen", lambda command, **_: _Child(log, command, lambda: None))
+        patch.setattr(
+            warmup.subprocess, "Popen", lambda command, env, **_: caches.add(env["NUMBA_CACHE_DIR"]) or _Child(log, command, lambda: None)
+        )
         warmup.warm_up.__wrapped__()
-    halves = ["run_steps()", "run_operations()"]
-    assert log == [f"{what} {half}" for what in ("start", "wait", "kill") for half in halves]
+    steps, operations = "run_steps()", "run_operations()"
+    apart = [f"start {steps}", f"start {operations}", f"wait {steps}", f"wait {operations}"]
+    assert log[:4] == apart and {f"kill {steps}", f"kill {operations}"} <= set(log[4:]) and len(caches) == 2
     program = (
         "from mmsynth.field.warmup import warm_up; warm_up()\n"
         "from mmsynth.field.kernels import cpu\n"
@@ -85,10 +88,11 @@ def test_what_is_interrupted_compiles_no_more(monkeypatch: pytest.MonkeyPatch) -
     log: list[str] = []
 
     def interrupted() -> None:
-        raise Interrupted("stop")
+        if log.count("wait run_steps()") == 1:
+            raise Interrupted("stop")
 
     monkeypatch.setattr(cpu, "is_compiled", lambda: False)
     monkeypatch.setattr(warmup.subprocess, "Popen", lambda command, **_: _Child(log, command, interrupted))
     with pytest.raises(Interrupted):
         warmup.warm_up.__wrapped__()
-    assert log[-2:] == ["kill run_steps()", "kill run_operations()"]
+    assert "kill run_steps()" in log and log[-2:] == ["kill run_operations()", "wait run_operations()"]

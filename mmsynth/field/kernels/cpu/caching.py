@@ -6,6 +6,7 @@ with parts of the old ones.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import shutil
@@ -15,6 +16,8 @@ from pathlib import Path
 
 from numba import config
 from numba.misc.appdirs import AppDirs
+
+from mmsynth.files import write_atomic
 
 
 def version_of_sources(folder: Path) -> str:
@@ -33,6 +36,20 @@ def remove_old_versions(folder: Path) -> None:
     versions = [path for path in folder.parent.glob("kernels-*") if path != folder and path.is_dir()]
     for path in sorted(versions, key=lambda path: path.stat().st_mtime, reverse=True)[_VERSIONS - 1 :]:
         shutil.rmtree(path, ignore_errors=True)
+
+
+def publish(made: Path, kept: Path, name: str) -> None:
+    """Put the code of a function from one folder of a cache into another, its index last; nothing where there is none.
+
+    Of two processes that compile into one folder, each may give its code a name that it does not know the other has taken, and an index
+    then leads to code of other types. So they compile apart.
+
+    Args:
+        name: of its index, without the ending.
+    """
+    if (made / f"{name}.nbi").is_file():
+        for path in [*made.glob(f"{name}.*.nbc"), made / f"{name}.nbi"]:
+            write_atomic(kept / path.name, functools.partial(shutil.copyfile, path))
 
 
 @contextmanager

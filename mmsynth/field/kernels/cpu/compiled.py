@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, optimiser, shading, surface, tracing_gradients
-from mmsynth.field.kernels.cpu.caching import remove_old_versions
+from mmsynth.field.kernels.cpu.caching import publish, remove_old_versions
 
 KERNELS = (
     surface.surface_forward, surface.surface_backward, surface.surface_scatter, surface.classify,
@@ -19,6 +19,13 @@ KERNELS = (
 def is_compiled() -> bool:
     """Whether every kernel has code for its usual types, in this process or in the cache on disk."""
     return all(k.signatures or _cached(k) for k in KERNELS)
+
+
+def keep_compiled(folder: Path) -> None:
+    """Put kernels that a process compiled with a folder of its own as numba's cache where they are looked for."""
+    for kernel in KERNELS:
+        kept = Path(kernel._cache._cache_path)
+        publish(folder / kept.parent.name / kept.name, kept, Path(kernel._cache._cache_file._index_name).stem)
 
 
 def remove_old_kernels() -> None:
