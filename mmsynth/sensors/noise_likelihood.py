@@ -141,7 +141,7 @@ def most_likely(start: Parameters, d: Values, factor: int, free: Sequence[Name],
     with_free = lambda x: replace(start, **dict(zip(free, x, strict=True)))
 
     count = len(d.value)
-    parts = [d[slice(begin, begin + _AT_ONCE)] for begin in range(0, count, _AT_ONCE)]
+    parts = [d[begin : begin + _AT_ONCE] for begin in range(0, count, _AT_ONCE)]
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         p, total, slopes = with_free(x), 0.0, np.zeros(5)
