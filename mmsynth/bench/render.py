@@ -29,6 +29,7 @@ from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import TILE, Field
 from mmsynth.field.kernels import Sampling, reference
+from mmsynth.field.tiles import side_by_side
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
@@ -162,7 +163,8 @@ def render(case: RenderCase, variant: Variant) -> Outputs:
     field = copy.copy(case.field)  # its tensors are shared
     field.sampling = variant.sampling
     with use_threads(variant.threads):
-        return _joined([field.render_rays(*tile, variant.modalities, variant.geometry) for tile in case.rays.tiles(variant.tile)])
+        found = side_by_side(lambda tile: field.render_rays(*tile, variant.modalities, variant.geometry), case.rays.tiles(variant.tile))
+        return _joined([outputs for _, outputs in found])
 
 
 def difference(found: Outputs, truth: Outputs, modalities: Sequence[str]) -> dict[str, float]:

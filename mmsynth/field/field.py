@@ -6,7 +6,7 @@ Its parts, and what rays see of them together, stand in one file: what one of th
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +26,7 @@ from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.picture import Rendering, picture_of
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
+from mmsynth.field.tiles import side_by_side
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
@@ -342,6 +343,28 @@ class Field(nn.Module):
         found = self.render_rays(*self.rays_of(directions, camera_to_world), modalities, geometry, light)
         return {key: value.cpu().numpy() for key, value in found.items()}
 
+    def cast_tiles(
+        self,
+        parts: Iterable[tuple[np.ndarray, np.ndarray]],
+        camera_to_world: np.ndarray,
+        modalities: Sequence[str],
+        geometry: bool,
+        light: bool = False,
+    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """``cast`` of as many rays as there are, by tiles, on a CPU side by side.
+
+        Args:
+            parts: numbers (N,) of rays and their directions (N, 3), made as they are needed.
+        Yields:
+            numbers of the rays of a tile, and what they show; tiles in the order of the rays.
+        """
+        size = self.tile
+        tiles = ((index[i : i + size], rays[i : i + size]) for index, rays in parts for i in range(0, len(index), size))
+        cast = lambda tile: self.cast(tile[1], camera_to_world, modalities, geometry, light)
+        found = side_by_side(cast, tiles) if self.device.type == "cpu" else ((tile, cast(tile)) for tile in tiles)
+        for (index, _), seen in found:
+            yield index, seen
+
     def rays_of(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""
         turned = torch.from_numpy((directions @ camera_to_world[:3, :3].T).astype(np.float32)).to(self.device)
@@ -373,17 +396,20 @@ class Field(nn.Module):
         pixels, valid = camera.width * camera.height, np.zeros(camera.width * camera.height, bool)
         images: dict[str, np.ndarray] = {}
         forward = np.zeros(pixels, np.float32)
-        # rays by parts: those of a whole picture of a full-size sensor would take more memory than what they show
-        for index, in_camera in rays_by_parts(camera, _AT_ONCE):
-            valid[index], forward[index] = True, in_camera[:, 2]
-            for start in range(0, len(index), self.tile):
-                rows = index[start : start + self.tile]
-                for key, value in self.cast(in_camera[start : start + self.tile], pose, names, geometry).items():
-                    if key not in images:
-                        images[key] = np.full((pixels, *value.shape[1:]), 0.0 if key == "opacity" else np.nan, np.float32)
-                    images[key][rows] = value
-                if progress is not None:
-                    progress(len(rows))
+
+        def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+            """Rays by parts: those of a whole picture of a full-size sensor would take more memory than what they show."""
+            for index, in_camera in rays_by_parts(camera, _AT_ONCE):
+                valid[index], forward[index] = True, in_camera[:, 2]
+                yield index, in_camera
+
+        for rows, found in self.cast_tiles(parts(), pose, names, geometry):
+            for key, value in found.items():
+                if key not in images:
+                    images[key] = np.full((pixels, *value.shape[1:]), 0.0 if key == "opacity" else np.nan, np.float32)
+                images[key][rows] = value
+            if progress is not None:
+                progress(len(rows))
         picture = functools.partial(picture_of, images, (camera.height, camera.width))
         depth = picture("depth", 1)[..., 0] * np.float32(self.region.radius)
         return Rendering(

@@ -41,9 +41,8 @@ def render_light(field: Field, camera: Camera, camera_to_world: np.ndarray, moda
         raise InputError("light: this field has no lamps, its surfaces mirror none.")
     in_camera, valid = ray_map(camera)
     rows = np.flatnonzero(valid)
-    directions = in_camera.reshape(-1, 3)[rows]
-    tiles = [directions[start : start + field.tile] for start in range(0, len(directions), field.tile)]
-    parts = [field.cast(tile, camera_to_world, names, geometry=False, light=True) for tile in tiles]
+    rays = rows, in_camera.reshape(-1, 3)[rows]
+    parts = [seen for _, seen in field.cast_tiles([rays], camera_to_world, names, geometry=False, light=True)]
 
     def image(key: str, channels: int) -> np.ndarray:
         out = np.full((valid.size, channels), np.nan, np.float32)

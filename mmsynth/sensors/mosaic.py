@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 _BAND = 1 << 18  # pixels that are demosaicked together
+_LEAST_NORM = 1e-6  # weight of the photosites around one; below it there are none
 BAYER = {  # channels 0, 1, 2 = red, green, blue, and OpenCV's name of the pattern: that of the pixels (1, 1) and (1, 2)
     ((0, 1), (1, 2)): cv2.COLOR_BayerBG2RGB_EA,
     ((2, 1), (1, 0)): cv2.COLOR_BayerRG2RGB_EA,
@@ -73,7 +74,7 @@ def demosaic(raw: Tensor, pattern: np.ndarray, offset: tuple[int, int] = (0, 0))
     channels, weight = present.shape[0], present.to(raw.dtype)
     frames = raw.reshape(-1, 1, height, width)
     size = max(pattern.shape)
-    tent = 1.0 - (torch.arange(-size + 1, size, dtype=raw.dtype, device=raw.device).abs() / size)
+    tent = torch.from_numpy(_tent(size)).to(raw)
 
     def blur(images: Tensor) -> Tensor:
         flat = images.reshape(-1, 1, height, width)
@@ -83,8 +84,13 @@ def demosaic(raw: Tensor, pattern: np.ndarray, offset: tuple[int, int] = (0, 0))
     total, norm = blur(torch.where(present, frames, 0.0)), blur(weight[None])
     # a corner farther than one tile from any photosite of the channel exists only in frames smaller than a tile
     mean = torch.where(present, frames, 0.0).sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True)
-    filled = torch.where(norm > 1e-6, total / norm.clamp(min=1e-6), mean)
+    filled = torch.where(norm > _LEAST_NORM, total / norm.clamp(min=_LEAST_NORM), mean)
     return torch.where(present, frames, filled).reshape(*raw.shape[:-2], channels, height, width)
+
+
+def _tent(size: int) -> np.ndarray:
+    """Weights (2 size - 1,) of the photosites within a tile of so many along an axis."""
+    return 1.0 - np.abs(np.arange(-size + 1, size)) / size
 
 
 def photosites_of(image: np.ndarray, pattern: np.ndarray) -> np.ndarray:
@@ -93,18 +99,25 @@ def photosites_of(image: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 def channels_of(frame: np.ndarray, pattern: np.ndarray | None) -> np.ndarray:
-    """``demosaic`` of a frame as files have it: (H, W) → (H, W, C); without a pattern it has all channels already."""
+    """``demosaic`` of a frame as files have it, by OpenCV's filters: (H, W) → (H, W, C); without a pattern it has all channels already."""
     if pattern is None:
         return frame
     # by bands of rows and what of their neighbours they take: all of a full-size frame takes ten times the memory of what it gives
     height, width = frame.shape
     rows, reach = pattern.shape[0], max(pattern.shape)
     step, margin = -(-max(_BAND // width, 4 * reach) // rows) * rows, -(-reach // rows) * rows  # whole tiles: bands keep the phase
-    out = np.empty((height, width, int(pattern.max()) + 1), frame.dtype)
+    tent, channels = _tent(reach), np.arange(int(pattern.max()) + 1)
+    blur = lambda images: cv2.sepFilter2D(images, -1, tent, tent, borderType=cv2.BORDER_CONSTANT).reshape(images.shape)
+    out = np.empty((height, width, len(channels)), frame.dtype)
     for top in range(0, height, step):
         first, last = max(top - margin, 0), min(top + step + margin, height)
-        found = demosaic(torch.from_numpy(np.ascontiguousarray(frame[first:last])), pattern)
-        out[top : top + step] = found.movedim(0, -1)[top - first : top - first + step].numpy()
+        present = channel_map(pattern, last - first, width)[..., None] == channels
+        own = np.where(present, frame[first:last, :, None], frame.dtype.type(0))
+        norm = blur(present.astype(frame.dtype))
+        with np.errstate(invalid="ignore"):  # 0 / 0: never measured
+            mean = own.sum((0, 1)) / present.sum((0, 1))
+        filled = np.where(norm > _LEAST_NORM, blur(own) / np.maximum(norm, _LEAST_NORM), mean)
+        out[top : top + step] = np.where(present, own, filled)[top - first : top - first + step]
     return out
 
 

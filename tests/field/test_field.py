@@ -17,7 +17,7 @@ from torch.nn.functional import normalize, softplus
 
 from mmsynth.errors import InputError
 from mmsynth.field import field as fields
-from mmsynth.field import kernels, rendering
+from mmsynth.field import kernels, rendering, tiles
 from mmsynth.field.design import Design
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import intensity, radiance
@@ -110,6 +110,27 @@ def test_a_rendering_does_not_depend_on_how_many_rays_are_made_together(monkeypa
     for name in whole.channels:
         np.testing.assert_allclose(seen.channels[name], whole.channels[name], atol=1e-6)
     np.testing.assert_allclose(seen.stokes["pol"], whole.stokes["pol"], atol=1e-6)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_pictures_are_the_same_to_the_bit_by_tiles_side_by_side(background: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    field, camera, pose = _field(background), Camera(64, 48, 50.0, 50.0, 31.5, 23.5, (-0.5, 0.1, 0.0, 0.0)), np.eye(4)
+    pose[2, 3] = -1.5
+    if not background:  # mirrors are most of what is not in the kernels
+        field.light = Light(field.appearance.width, field.shader.heads.out_features)
+        field.light.add(torch.tensor([[1.0, 2.0, -3.0], [0.0, 3.0, 1.0]]))
+    monkeypatch.setattr(fields, "TILE", 128)
+    monkeypatch.setattr(fields, "_AT_ONCE", 1000)
+    seen = []
+    for threads in (1, 3, 3):
+        monkeypatch.setattr(tiles, "_threads", lambda threads=threads: threads)
+        seen.append(field.render(camera, pose))
+    for other in seen[1:]:
+        for part in ("depth_z", "opacity", "normal", "valid"):
+            np.testing.assert_array_equal(getattr(other, part), getattr(seen[0], part))
+        for name in SENSORS:
+            np.testing.assert_array_equal(other.channels[name], seen[0].channels[name])
+    assert np.isfinite(seen[0].depth_z).sum() > 300
 
 
 def test_sdf_with_a_background_is_the_one_that_is_rendered() -> None:

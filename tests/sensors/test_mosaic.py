@@ -133,3 +133,11 @@ def test_a_frame_demosaicked_by_bands_is_the_frame_demosaicked(pattern: list[lis
     whole = demosaic(torch.from_numpy(frame), tile).movedim(0, -1).numpy()
     monkeypatch.setattr(mosaics, "_BAND", 1)
     np.testing.assert_allclose(channels_of(frame, tile), whole, atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 7), (4, 2)])
+def test_a_frame_of_a_file_that_is_smaller_than_its_tile(shape: tuple[int, int]) -> None:
+    frame = np.random.default_rng(0).random(shape).astype(np.float32)
+    for pattern in PATTERNS:
+        expected = demosaic(torch.from_numpy(frame), pattern).movedim(0, -1).numpy()
+        np.testing.assert_allclose(channels_of(frame, pattern), expected, rtol=1e-6)

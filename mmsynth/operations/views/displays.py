@@ -199,7 +199,7 @@ def look(field: Field, view: PosedCamera, displays: Iterable[Display], go_on: Ca
     """What a camera sees of all that displays need.
 
     Args:
-        go_on: asked after every tile of rays, see ``Field.tile``.
+        go_on: asked after every tile of rays.
     Returns:
         None where ``go_on`` said no.
     """
@@ -210,9 +210,8 @@ def look(field: Field, view: PosedCamera, displays: Iterable[Display], go_on: Ca
     rows = np.flatnonzero(valid)
     directions = in_camera.reshape(-1, 3)[rows]
     found: dict[str, np.ndarray] = {}
-    for start in range(0, len(rows), field.tile):
-        part = rows[start : start + field.tile]
-        for key, value in field.cast(directions[start : start + field.tile], view.camera_to_world, names, normals, light).items():
+    for part, seen in field.cast_tiles([(rows, directions)], view.camera_to_world, names, normals, light):
+        for key, value in seen.items():
             if key not in found:
                 found[key] = np.full((valid.size, *value.shape[1:]), np.nan, np.float32)
             found[key][part] = value

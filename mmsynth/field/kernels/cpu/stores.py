@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import threading
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -25,6 +26,7 @@ _IDLE = 100  # stores that were asked for since: what was not used again is let 
 _TAPS = 4 * MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
 _pool: list[tuple[Any, Any, int]] = []  # of each, when it was given back
 _asked = itertools.count()
+_changing = threading.RLock()  # of the pool. A thread that holds it may find garbage to give back
 
 
 class SurfaceStore(NamedTuple):
@@ -95,18 +97,21 @@ class Store(Generic[S]):
     def __init__(self, slots: int, kind: Callable[..., S], sizes: Key) -> None:
         self.key, now = (kind, sizes), next(_asked)
         slots = 1 << max(slots - 1, 3).bit_length()
-        _pool[:] = [entry for entry in _pool if now - entry[2] <= _IDLE]
-        for index, (key, arrays, _) in enumerate(_pool):
-            if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots:
-                self.arrays = _pool.pop(index)[1]
-                break
+        with _changing:
+            _pool[:] = [entry for entry in _pool if now - entry[2] <= _IDLE]
+            fits = (i for i, (key, arrays, _) in enumerate(_pool) if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots)
+            found = next(fits, None)
+            kept = None if found is None else _pool.pop(found)[1]
+        if kept is not None:
+            self.arrays = kept
         else:
             self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
         self.now = now
 
     def __del__(self) -> None:
         if hasattr(self, "now"):  # none where memory lacked for arrays
-            _pool.append((self.key, self.arrays, self.now))
+            with _changing:
+                _pool.append((self.key, self.arrays, self.now))
 
 
 def _tiles(count: int) -> int:

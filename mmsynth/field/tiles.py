@@ -1,0 +1,80 @@
+"""Work on many rays by tiles: on a CPU side by side, each tile on a core of its own.
+
+A kernel that all cores share is followed by operations that one core does, and by all that Python does between them; tiles side by side
+leave no core without work.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent import futures
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numba
+import torch
+
+P = TypeVar("P")
+T = TypeVar("T")
+
+_AHEAD = 4  # tiles of each thread that are begun before the first of them is asked for
+_SAFE = ("omp", "tbb")  # numba's threading layers that may be called by several threads; the last resort, workqueue, ends the process
+
+
+def side_by_side(work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[tuple[P, T]]:
+    """What ``work`` makes of each tile, in their order; tiles are made as they are needed. What it makes may not depend on threads.
+
+    Where there are fewer tiles than threads, or numba's threads may not be shared, all threads work on one tile after the other.
+    """
+    coming, threads = iter(tiles), _threads()
+    first = list(itertools.islice(coming, threads))
+    if threads == 1 or len(first) < threads:
+        for tile in itertools.chain(first, coming):
+            yield tile, work(tile)
+        return
+    pool, begun = _alone(threads), deque[tuple[P, futures.Future[T]]]()
+    try:
+        for tile in itertools.chain(first, coming):
+            begun.append((tile, pool.submit(work, tile)))
+            if len(begun) == _AHEAD * threads:
+                done, result = begun.popleft()
+                yield done, result.result()
+        while begun:
+            done, result = begun.popleft()
+            yield done, result.result()
+    finally:  # one has failed, or no more are wanted
+        for _, result in begun:
+            result.cancel()
+
+
+def _threads() -> int:
+    """Threads that tiles may have, those that numba is to use."""
+    count = numba.get_num_threads()  # starts them, so that their layer is known
+    return count if numba.threading_layer() in _SAFE else 1
+
+
+@functools.cache
+def _alone(threads: int) -> ThreadPoolExecutor:
+    """So many threads, in each of which torch and numba have that thread alone."""
+    pool, all_there = ThreadPoolExecutor(threads, "tile"), threading.Barrier(threads)
+    own = torch.get_num_threads()
+
+    def settle() -> None:
+        all_there.wait()
+        numba.set_num_threads(1)
+        torch.get_num_threads()  # a thread that has not asked takes on, when it first does, what was set last in any
+        torch.set_num_threads(1)
+
+    for started in [pool.submit(settle) for _ in range(threads)]:
+        started.result()
+    torch.set_num_threads(own)  # of this thread, and of those that begin later
+    return pool
+
+
+if hasattr(os, "register_at_fork"):  # Unix: a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_alone.cache_clear)

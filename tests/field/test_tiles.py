@@ -1,0 +1,106 @@
+"""Tiles side by side: in their order, each on one thread."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+
+import numba
+import pytest
+import torch
+
+from mmsynth.field import tiles
+from mmsynth.field.kernels.cpu import stores
+from mmsynth.field.tiles import side_by_side
+
+
+@pytest.fixture
+def threads(monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(tiles, "_threads", lambda: 3)
+    return 3
+
+
+def test_tiles_come_in_their_order_and_are_made_as_they_are_needed(threads: int) -> None:
+    made: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for i in range(100):
+            made.append(i)
+            yield i
+
+    gate = threading.Event()
+    found = side_by_side(lambda i: (gate.wait() if i == 0 else None, i * i)[1], numbers())
+    threading.Timer(0.05, gate.set).start()  # the first is the last to be ready
+    assert next(found) == (0, 0) and len(made) == tiles._AHEAD * threads
+    assert list(found) == [(i, i * i) for i in range(1, 100)]
+
+
+def test_each_has_a_thread_of_its_own_and_all_others_keep_theirs(threads: int) -> None:
+    before = torch.get_num_threads(), numba.get_num_threads()
+    meet = threading.Barrier(threads)  # no thread takes two tiles
+
+    def look(_: int) -> tuple[int, int, int]:
+        meet.wait(10)
+        return threading.get_ident(), torch.get_num_threads(), numba.get_num_threads()
+
+    seen = [found for _, found in side_by_side(look, range(threads))]
+    assert len({who for who, _, _ in seen}) == threads and {(of_torch, of_numba) for _, of_torch, of_numba in seen} == {(1, 1)}
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+    later: list[int] = []
+    thread = threading.Thread(target=lambda: later.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert later == [before[0]]
+
+
+def test_fewer_tiles_than_threads_have_all_of_them_one_after_the_other(threads: int) -> None:
+    here = threading.get_ident()
+    assert [found for _, found in side_by_side(lambda _: threading.get_ident(), range(threads - 1))] == [here] * (threads - 1)
+    assert list(side_by_side(lambda tile: tile, [])) == []
+
+
+def test_numbas_last_resort_is_never_called_by_two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    for layer, expected in (("workqueue", 1), ("omp", 2), ("tbb", 2)):
+        monkeypatch.setattr(numba, "threading_layer", lambda layer=layer: layer)
+        assert tiles._threads() == expected
+
+
+def test_one_that_fails_ends_it_and_what_has_not_begun_is_not_worked_on(threads: int) -> None:
+    done: list[int] = []
+
+    def work(i: int) -> None:
+        done.append(i)
+        if i == 2:
+            raise ValueError("tile 2")
+
+    with pytest.raises(ValueError, match="tile 2"):
+        list(side_by_side(work, range(1000)))
+    assert len(done) <= 3 + tiles._AHEAD * threads
+    found = side_by_side(lambda i: i, range(1000))
+    assert next(found) == (0, 0)
+    found.close()  # no more are wanted
+    assert list(side_by_side(lambda i: i + 1, range(5))) == [(i, i + 1) for i in range(5)]
+
+
+def test_arrays_that_several_threads_ask_for_have_one_owner_each(threads: int) -> None:
+    """What is kept for the next to ask was looked for and taken in two steps: another could take it between them."""
+    kinds = [stores.surface_store, lambda *of: stores.ray_store(*of, 2)]
+    switch = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+
+    def ask(i: int) -> int:
+        wrong = 0
+        for j in range(200):
+            store = kinds[(i + j) % 2](1, 8 * (1 + (i + j) % 3), 2)
+            wrong += store.arrays._fields != (stores.SurfaceStore if (i + j) % 2 == 0 else stores.RayStore)._fields
+            store.arrays[0].flat[0] = i
+            sum(range(20))
+            wrong += store.arrays[0].flat[0] != i
+        return wrong
+
+    try:
+        assert sum(wrong for _, wrong in side_by_side(ask, range(12))) == 0
+    finally:
+        sys.setswitchinterval(switch)
