@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,19 +126,7 @@ class AnalyticField:
             out |= {"roughness": np.where(hit, 0.25, np.nan), "strength": np.where(hit, 2.0, np.nan)}
         return {key: value.astype(np.float32) for key, value in out.items()}
 
-    def cast_tiles(
-        self,
-        parts: Iterable[tuple[np.ndarray, np.ndarray]],
-        camera_to_world: np.ndarray,
-        modalities: Sequence[str],
-        geometry: bool,
-        light: bool = False,
-    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """As ``Field.cast_tiles``."""
-        for index, rays in parts:
-            for i in range(0, len(index), self.tile):
-                part = slice(i, i + self.tile)
-                yield index[part], self.cast(rays[part], camera_to_world, modalities, geometry, light)
+    cast_tiles = Field.cast_tiles
 
     device = torch.device("cpu")
 

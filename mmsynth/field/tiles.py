@@ -38,15 +38,18 @@ def side_by_side(work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[tuple[P
             yield tile, work(tile)
         return
     pool, begun = _alone(threads), deque[tuple[P, futures.Future[T]]]()
+
+    def oldest() -> tuple[P, T]:
+        tile, result = begun.popleft()
+        return tile, result.result()
+
     try:
         for tile in itertools.chain(first, coming):
             begun.append((tile, pool.submit(work, tile)))
             if len(begun) == _AHEAD * threads:
-                done, result = begun.popleft()
-                yield done, result.result()
+                yield oldest()
         while begun:
-            done, result = begun.popleft()
-            yield done, result.result()
+            yield oldest()
     finally:  # one has failed, or no more are wanted
         for _, result in begun:
             result.cancel()

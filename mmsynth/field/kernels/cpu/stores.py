@@ -99,13 +99,12 @@ class Store(Generic[S]):
         slots = 1 << max(slots - 1, 3).bit_length()
         with _changing:
             _pool[:] = [entry for entry in _pool if now - entry[2] <= _IDLE]
-            fits = (i for i, (key, arrays, _) in enumerate(_pool) if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots)
-            found = next(fits, None)
-            kept = None if found is None else _pool.pop(found)[1]
-        if kept is not None:
-            self.arrays = kept
-        else:
-            self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
+            for index, (key, arrays, _) in enumerate(_pool):
+                if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots:
+                    self.arrays = _pool.pop(index)[1]
+                    break
+            else:
+                self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
         self.now = now
 
     def __del__(self) -> None:
