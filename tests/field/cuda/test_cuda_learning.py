@@ -3,6 +3,7 @@
 import pytest
 import test_learning
 import torch
+from on_device import make_on_cpu
 
 from mmsynth.field import kernels
 from mmsynth.field.kernels import cuda
@@ -10,8 +11,8 @@ from mmsynth.field.kernels import cuda
 
 @pytest.mark.parametrize("case", ["background", "far light", "all"])
 def test_a_step_is_that_of_the_definition(device: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if device == "cuda":
-        torch.set_default_device(device)
+    make_on_cpu(test_learning, "_step", device, monkeypatch)
     monkeypatch.setattr(kernels, "learn", lambda arranged: cuda.learn(arranged.step))
     monkeypatch.setattr(test_learning, "RAYS", 36)
-    test_learning.test_a_step_is_that_of_the_definition(case)
+    with torch.device(device):
+        test_learning.test_a_step_is_that_of_the_definition(case)

@@ -1,9 +1,12 @@
 """Shading and mirrored lamps in Triton: the cases of the CPU's kernels, against the definition in float64."""
 
+from collections.abc import Iterator
+
 import pytest
 import test_light
 import test_shading
 import torch
+from on_device import make_on_cpu
 from test_shading import ANALYSERS, FILM, MOSAIC, TENSOR
 
 from mmsynth.field import kernels
@@ -11,10 +14,12 @@ from mmsynth.field.kernels import Lamps, Measured, Mirrors, cuda, reference
 
 
 @pytest.fixture(autouse=True)
-def _by_triton(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if device == "cuda":
-        torch.set_default_device(device)
+def _by_triton(device: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(kernels, "_backend", lambda tensor: cuda if tensor.dtype == torch.float32 else reference)
+    for module in (test_light, test_shading):
+        make_on_cpu(module, "_case", device, monkeypatch)
+    with torch.device(device):
+        yield
 
 
 def test_compare() -> None:

@@ -18,7 +18,7 @@ from mmsynth.field.kernels.cuda.shared import HUBER, LEAST_WEIGHT, MOSTLY_BLOCKE
 from mmsynth.field.kernels.parameters import Measured, Opacities, ShadedRays, ShaderWeights
 
 RAYS = 32  # of a program: with more, or with its weights' gradients kept in registers over several times as many, registers spill
-_WARPS = 8
+_WARPS = 4  # a warp has 16 rows of a product: with 8, those of 64 rows end in shared memory that is not theirs (triton 3.6 on sm_90)
 
 
 @jit
