@@ -152,16 +152,18 @@ def evaluate(
     convert: Annotated[
         str | None, typer.Option(help="score conversions instead, e.g. rgb:ms or rgb:ms,mono:pol; all: every pair", metavar="FROM:TO")
     ] = None,
+    device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Score the test views."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.evaluation.conversions import evaluate_conversions
     from mmsynth.report.text import conversion_text, score_text
     from mmsynth.workflows.fit import evaluate_run
     from mmsynth.workflows.runs import open_run
 
     meaning, folder = masks_of(masks)
-    opened = open_run(run, masks=meaning, mask_folder=folder)
+    opened = open_run(run, device=pick_device(device), masks=meaning, mask_folder=folder)
     with progress_bar("evaluate", as_json) as show:
         if convert is None:
             scores = evaluate_run(opened, progress=show)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mmsynth.cli.arguments import JsonOption, RunOption
+from mmsynth.cli.arguments import DeviceOption, JsonOption, RunOption
 from mmsynth.cli.terminal import command, progress_bar
 
 if TYPE_CHECKING:
@@ -22,23 +22,26 @@ HostOption = Annotated[str, typer.Option(help="address to listen at; default: th
 
 
 @command("view")
-def view(run: RunOption = None, port: PortOption = 8080, host: HostOption = "127.0.0.1") -> None:
+def view(run: RunOption = None, port: PortOption = 8080, host: HostOption = "127.0.0.1", device: DeviceOption = "auto") -> None:
     """Look at a field in the browser; ctrl-c ends it."""
     from mmsynth.errors import InputError
     from mmsynth.field.warmup import warm_up
+    from mmsynth.fitting.device import pick_device
     from mmsynth.viewer.open import open_viewer, serve
     from mmsynth.viewer.viewer import require_free
     from mmsynth.workflows.runs import open_field, open_run
 
     require_free(host, port)
+    chosen = pick_device(device)
     try:
-        opened = open_run(run)
+        opened = open_run(run, device=chosen)
         folder, field, scene = opened.folder, opened.field, opened.scene
     except InputError as error:
-        folder, field = open_field(run)  # the field can be looked at without its scene
+        folder, field = open_field(run, device=chosen)  # the field can be looked at without its scene
         scene = None
         print(f"note: {error} The field is shown without its frames.")
-    warm_up()
+    if chosen == "cpu":
+        warm_up()
     viewer = open_viewer(field, scene, folder, host=host, port=port)
     print(listening(viewer.url, host), flush=True)
     serve(viewer)
@@ -85,14 +88,16 @@ def video(
     fps: Annotated[float, typer.Option(min=0.1, max=240.0, help="pictures a second")] = 24.0,
     width: Annotated[int | None, typer.Option(min=16, max=16384, help="pixels of a row; default: as the poses' cameras have them")] = None,
     out: Annotated[Path | None, typer.Option(help="default: RUN/videos/POSES.mp4")] = None,
+    device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Film a path through a field."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.views.displays import find_display
     from mmsynth.operations.views.video import write_video
     from mmsynth.workflows.runs import open_run
 
-    opened = open_run(run)
+    opened = open_run(run, device=pick_device(device))
     names = [find_display(opened.field, name).name for name in show.split(",") if name.strip()]
     destination = out or opened.folder / "videos" / f"{poses.stem}.mp4"
     with progress_bar("video", as_json) as bar:

@@ -53,17 +53,19 @@ def convert(
     ] = False,
     file_format: Annotated[str, typer.Option("--format", help="npz, exr or tiff")] = "npz",
     out: Annotated[Path | None, typer.Option(help="default: RUN/convert/FROM_to_TO")] = None,
+    device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Convert frames of one modality into another, at the frames' poses or at any poses."""
     from mmsynth.files import read_json
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.conversion.files import convert_files
     from mmsynth.report.conversion import source_previews, write_conversion_report
     from mmsynth.report.text import converted_text
     from mmsynth.scene.scene import canonical_modality
     from mmsynth.workflows.runs import open_run
 
-    opened = open_run(run)
+    opened = open_run(run, device=pick_device(device))
     folder, field, scene = opened.folder, opened.field, opened.scene
     if views is not None and (images or poses):
         raise InputError("--views: frames of the scene are converted with it, expected it without --images and --poses.")
@@ -180,15 +182,17 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="of noise and fixed patterns")] = 0,
     file_format: Annotated[str, typer.Option("--format", help="png, tiff or dng")] = "png",
     out: Annotated[Path | None, typer.Option(help="default: RUN/simulated")] = None,
+    device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Simulate the raw frames of sensors; the result is a scene that can be fitted again."""
-    from mmsynth.operations.output.work_partition import partition_of_environment
+    from mmsynth.fitting.device import pick_device
+    from mmsynth.operations.output.work_partition import local_device, partition_of_environment
     from mmsynth.operations.simulation import simulate as twins
     from mmsynth.workflows.runs import open_run
 
     part = partition_of_environment()
-    opened = open_run(run)
+    opened = open_run(run, device=local_device(pick_device(device)))
     folder, field, scene = opened.folder, opened.field, opened.scene
     destination = out or folder / "simulated"
     with progress_bar("simulate", as_json) as show:
@@ -221,9 +225,11 @@ def calibrate_noise(
     raw: Annotated[Path | None, typer.Option(help="other frames at the same poses, of any exposure: RAW/MODALITY/0009.png")] = None,
     views: Annotated[str | None, typer.Option(help="view ids, e.g. 9,19; default: those of the training")] = None,
     out: Annotated[Path | None, typer.Option(help="default: RUN/sensors, or sensors")] = None,
+    device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Measure gain, read noise and PRNU by photon transfer, into sensor files; from a scene's frames and field, or frames alone."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.simulation import calibrate_noise as noise
     from mmsynth.report.text import noise_text
     from mmsynth.sensors.sensor_file import find_sensor_file, load_sensor
@@ -237,7 +243,7 @@ def calibrate_noise(
         destination, calibrated = out or Path("sensors"), {files[0].name: noise.calibrate_from_frames(files[0], frames)}
         noise.write(calibrated, destination)
     else:
-        opened = open_run(run)
+        opened = open_run(run, device=pick_device(device))
         destination = out or opened.folder / "sensors"
         with progress_bar("noise", as_json) as show:
             calibrated, failed = noise.calibrate_noise(
@@ -266,17 +272,19 @@ def mesh(
     geometry_only: Annotated[bool, typer.Option("--geometry-only", help="no colours and no modalities on the vertices")] = False,
     against: Annotated[Path | None, typer.Option(help="score it against this mesh, in the same frame and unit")] = None,
     distances: Annotated[str | None, typer.Option(help="of the F-score, e.g. 0.001,0.002; default: 0.5, 1 and 2 % of the radius")] = None,
+    device: DeviceOption = "auto",
     as_json: JsonOption = False,
 ) -> None:
     """Extract the surface as a mesh with every modality on its vertices, in the input's frame and unit."""
+    from mmsynth.fitting.device import pick_device
     from mmsynth.operations.mesh.extract import MeshOptions, keep_of, mesh_to_file
     from mmsynth.report.text import mesh_text
     from mmsynth.workflows.runs import open_field, open_run
 
     if geometry_only and not min_views and against is None:
-        (folder, field), scene = open_field(run), None  # the scene may be elsewhere
+        (folder, field), scene = open_field(run, device=pick_device(device)), None  # the scene may be elsewhere
     else:
-        opened = open_run(run)
+        opened = open_run(run, device=pick_device(device))
         folder, field, scene = opened.folder, opened.field, opened.scene
     destination, at = out or folder / "mesh.ply", lengths(distances)
     options = MeshOptions(

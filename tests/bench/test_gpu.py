@@ -26,7 +26,7 @@ def launches() -> list[gpu.Launch]:
 
 def test_calls_are_recorded_and_do_not_run() -> None:
     names = [launch.name for launch in gpu.launches_of(gpu.calls()[0])]
-    assert names == ["march", "weigh", "look", "look_backward", "weigh_backward", "surface_backward"]
+    assert names == ["enter", "march", "weigh", "look", "look_backward", "weigh_backward", "surface_backward"]
     names = [launch.name for launch in gpu.launches_of(gpu.calls()[-1])]
     assert names[-1] == "rays_backward"
 
@@ -44,7 +44,7 @@ def _rows_beyond(ttgir: str) -> list[str]:
 
 
 # bytes, of what a thread keeps: loads and stores of its own cache line
-SPILLED = {"surface_backward": {80: 256, 90: 0, 100: 64}}
+SPILLED = {"surface_backward": {80: 256, 90: 0, 100: 64}, "march": {80: 32, 90: 8}}
 
 
 @pytest.mark.slow
@@ -59,14 +59,22 @@ def test_every_kernel_compiles_and_where_it_spills_is_known(target: int, launche
             assert "ld.global.v4.b32" in result.asm["ptx"], launch.name
 
 
+# of what triton 3.6 makes of a chain of two products of 64 rows for eight warps: the upper four read beyond the shared memory
+EIGHT_WARPS = """
+#mma = #ttg.nvidia_mma<{versionMajor = 3, versionMinor = 0, warpsPerCTA = [4, 2], instrShape = [16, 16, 8]}>
+#mma1 = #ttg.nvidia_mma<{versionMajor = 3, versionMinor = 0, warpsPerCTA = [8, 1], instrShape = [16, 32, 8]}>
+%1 = ttng.warp_group_dot %a, %b, %c {inputPrecision = 0 : i32} : tensor<64x32xf32> * !ttg.memdesc<32x64xf32> -> tensor<64x64xf32, #mma>
+%2 = ttng.warp_group_dot %1, %b, %c {inputPrecision = 0 : i32} : tensor<64x64xf32> * !ttg.memdesc<64x64xf32> -> tensor<64x64xf32, #mma1>
+"""
+
+
 @pytest.mark.slow
 def test_no_warp_multiplies_rows_that_are_not_there() -> None:
-    """triton 3.6 gives eight warps 128 rows of a chain of products of 64, and the upper ones read beyond the shared memory."""
+    """An H100 found it: an illegal memory access in the second step of a fit."""
+    assert _rows_beyond(EIGHT_WARPS) == ["mma1: 128 rows of 64"]
     found = {launch.name: launch for launch in step_launches(device_step(example_trainer(), 3), True).calls}
     for name in ("compare", "light", "light_backward"):
         assert not _rows_beyond(gpu.compiled(found[name], 90)[1].asm["ttgir"]), name
-    wrong = found["compare"]._replace(options=found["compare"].options | {"num_warps": 8})
-    assert _rows_beyond(gpu.compiled(wrong, 90)[1].asm["ttgir"])
 
 
 def test_without_triton_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

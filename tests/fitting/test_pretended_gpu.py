@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -25,9 +26,12 @@ from mmsynth.fitting import trainer as trainer_module
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.graphs import Repeated
 from mmsynth.fitting.run import fit
+from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.dataset.generate import generate_dataset
 from mmsynth.operations.evaluation.evaluate import evaluate
 from mmsynth.operations.mesh.extract import MeshOptions, extract_mesh
+from mmsynth.operations.simulation.simulate import simulate
+from mmsynth.operations.views.displays import find_display, look
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import PosedCamera
@@ -203,12 +207,22 @@ def test_what_is_made_on_a_gpu_is_what_the_cpu_makes(tmp_path: Path, monkeypatch
         again = load_field(tmp_path / device, device=device)
         generate_dataset(again, views, tmp_path / device / "dataset", scene=scene)
         mesh = extract_mesh(again, MeshOptions(resolution=12), scene=scene)
+        convert_files(again, scene, tmp_path / device / "converted", source="rgb", target="nir")
         made = {}
-        for path in sorted((tmp_path / device / "dataset").rglob("*.npz")):
+        for path in sorted((tmp_path / device).rglob("*.npz")):
             with np.load(path) as file:
-                made |= {f"{path.stem}/{name}": file[name] for name in file.files if file[name].dtype.kind in "fiu"}
-        return {"scores": scores["modalities"], "view": made, "vertices": mesh.vertices.copy(), "colours": mesh.visual.vertex_colors.copy()}
+                made |= {
+                    f"{path.relative_to(tmp_path / device)}/{name}": file[name] for name in file.files if file[name].dtype.kind in "fiu"
+                }
+        shown = look(again, views[0], [find_display(again, name) for name in ("rgb", "normals", "nir")])
+        simulate(again, ["mmsdata_infrared"], tmp_path / device / "frames", frames="test", scene=scene)
+        frames = {path.name: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted((tmp_path / device / "frames").rglob("*.png"))}
+        return {
+            "scores": scores["modalities"], "files": made, "vertices": mesh.vertices.copy(), "colours": mesh.visual.vertex_colors.copy(),
+            "shown": shown, "frames": frames,
+        }  # fmt: skip
 
     on_cpu, on_gpu = _on_both(work, monkeypatch)
-    assert 0.0 < on_gpu["scores"]["rgb"]["psnr"] < 60.0 and len(on_gpu["vertices"]) > 50 and len(on_gpu["view"]) > 5
+    assert 0.0 < on_gpu["scores"]["rgb"]["psnr"] < 60.0 and len(on_gpu["vertices"]) > 50 and len(on_gpu["files"]) > 8
+    assert on_gpu["frames"] and any("converted" in name for name in on_gpu["files"])
     _same(on_gpu, on_cpu)

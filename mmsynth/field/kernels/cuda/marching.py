@@ -1,8 +1,9 @@
-"""Rays through the field in Triton: to all their samples and the distances there in one kernel, without the host.
+"""Rays through the field in Triton: to all their samples and the distances there in two kernels, without the host.
 
-A program has ``LANES`` rays under way, one per lane. In each round every lane goes to the next sample of its ray, and the surface is
-evaluated there for all of them; a lane whose ray has ended takes the next ray of a queue, a counter in memory. What a ray
-gives does not depend on the lane that takes it. Samples of a ray are the columns of (MAX_SAMPLES, R) arrays.
+The first takes each ray to where it may meet something: that is far for most, and no two are alike. A program of the second has ``LANES``
+rays under way, one per lane. In each round every lane goes on towards the next sample of its ray, over ``SKIPS`` free cells at the most,
+and the surface is evaluated there for all of them; a lane whose ray has ended takes the next ray of a queue, a counter in memory. What
+a ray gives does not depend on the lane that takes it. Samples of a ray are the columns of (MAX_SAMPLES, R) arrays.
 """
 
 from __future__ import annotations
@@ -26,7 +27,11 @@ from mmsynth.field.kernels.cuda.shared import (
 )
 from mmsynth.field.kernels.cuda.surface import distance
 
-LANES = 64  # rays under way per program, which waits for the slowest of them at every sample
+# the fastest of 17 on an H100: programs of one warp wait for nobody else, and as many as registers allow
+LANES = 16  # rays under way per program, which waits for the slowest of them at every sample
+PER_CORE = 8  # programs
+OPTIONS = {"num_warps": 1, "num_stages": 1}
+SKIPS = 2  # a lane that is not there by then goes on beside the others' next samples
 
 
 @jit
@@ -60,69 +65,96 @@ def _leave(x, velocity, cell, half, extent):  # type: ignore[no-untyped-def]
 
 
 @jit
-def _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, states, grid, half, extent, step, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
-    """See ``reference._advance``: t, position, distance from the centre, speed, state. Only t is meant where t is not before far."""
-    ahead = t < far
-    entered = t < t  # nowhere yet
-    speed = tl.zeros_like(t) + 1.0
-    reach = tl.zeros_like(t) + 1.0
-    state = tl.zeros_like(t).to(tl.int32)
+def _look(ox, oy, oz, dx, dy, dz, t, states, grid, half, extent, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """At t: cell, position and velocity in the frame of the grid, distance from the centre, speed, state."""
+    x, y, z, reach = contracted(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTED)
+    vx, vy, vz = dx, dy, dz
+    if CONTRACTED:
+        length = 2.0 - 1.0 / reach  # of x, where it is more than 1
+        ux, uy, uz = x / length, y / length, z / length
+        across = (2.0 * reach - 1.0) / (reach * reach)
+        radial = (ux * dx + uy * dy + uz * dz) * (1.0 / (reach * reach) - across)
+        vx = tl.where(reach > 1.0, dx * across + ux * radial, dx)
+        vy = tl.where(reach > 1.0, dy * across + uy * radial, dy)
+        vz = tl.where(reach > 1.0, dz * across + uz * radial, dz)
+    speed = tl.sqrt(vx * vx + vy * vy + vz * vz)
+    ix, iy, iz = _cell(x, half, extent, grid), _cell(y, half, extent, grid), _cell(z, half, extent, grid)
+    state = tl.load(states + (ix * grid + iy) * grid + iz).to(tl.int32)
+    return ix, iy, iz, x, y, z, vx, vy, vz, reach, speed, state
+
+
+@jit
+def _skip(ox, oy, oz, dx, dy, dz, t, far, ahead, states, grid, half, extent, step, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """See ``reference._advance``: of the rays that are ``ahead`` of where they arrive, those in a free cell leave it. t, distance from
+    the centre, speed and state before, whether a ray left; of a ray that has arrived, this finds the same again."""
+    ix, iy, iz, x, y, z, vx, vy, vz, reach, speed, state = _look(ox, oy, oz, dx, dy, dz, t, states, grid, half, extent, CONTRACTED)
+    outside = ahead & (state >= OUTSIDE)
+    leave = tl.minimum(_leave(x, vx, ix, half, extent), _leave(y, vy, iy, half, extent))
+    leave = tl.maximum(tl.minimum(leave, _leave(z, vz, iz, half, extent)), 0.0)
+    # the cell's certificate may reach beyond it
+    leave = tl.maximum(leave, (state - OUTSIDE).to(tl.float32) / (2.0 * half * speed)) + step / speed * FACE_OVERSHOOT
+    if CONTRACTED:
+        leave = tl.minimum(leave, reach * LONGEST_STEP)
+    return tl.where(outside, tl.maximum(t + leave, t * LEAST_ADVANCE), t), reach, speed, state, outside
+
+
+@jit
+def enter_kernel(  # type: ignore[no-untyped-def]
+    origins, directions, nears, fars, jitters, states, queue, entries, counts, step_at, rays, grid, extent,
+    CONTRACTED: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Where rays come to the first cell that is not free, or to their ends.
+
+    queue: (2,) int32: cleared for ``march_kernel``. entries: (rays,) ray distance. counts: (rays,) int32: -1 where the ray came through
+    free cells, 0 where it begins there.
+    """
+    i = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    live = i < rays
+    step = tl.load(step_at).to(tl.float32)
+    half = 0.5 * grid / extent
+    ox, oy, oz = position(origins, i, live)
+    dx, dy, dz = position(directions, i, live)
+    far = tl.load(fars + i, mask=live, other=0.0)
+    begin = tl.load(nears + i, mask=live, other=0.0) + tl.load(jitters + i, mask=live, other=0.0) * step
+    t = begin
+    ahead = live & (t < far)
+    came = t < t
     while tl.max(ahead.to(tl.int32), 0) > 0:
-        # of a ray that has arrived, this finds the same again
-        x, y, z, reach = contracted(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTED)
-        vx, vy, vz = dx, dy, dz
-        if CONTRACTED:
-            length = 2.0 - 1.0 / reach  # of x, where it is more than 1
-            ux, uy, uz = x / length, y / length, z / length
-            across = (2.0 * reach - 1.0) / (reach * reach)
-            radial = (ux * dx + uy * dy + uz * dz) * (1.0 / (reach * reach) - across)
-            vx = tl.where(reach > 1.0, dx * across + ux * radial, dx)
-            vy = tl.where(reach > 1.0, dy * across + uy * radial, dy)
-            vz = tl.where(reach > 1.0, dz * across + uz * radial, dz)
-        speed = tl.sqrt(vx * vx + vy * vy + vz * vz)
-        ix, iy, iz = _cell(x, half, extent, grid), _cell(y, half, extent, grid), _cell(z, half, extent, grid)
-        state = tl.load(states + (ix * grid + iy) * grid + iz).to(tl.int32)
-        outside = ahead & (state >= OUTSIDE)
-        leave = tl.minimum(_leave(x, vx, ix, half, extent), _leave(y, vy, iy, half, extent))
-        leave = tl.maximum(tl.minimum(leave, _leave(z, vz, iz, half, extent)), 0.0)
-        # the cell's certificate may reach beyond it
-        leave = tl.maximum(leave, (state - OUTSIDE).to(tl.float32) / (2.0 * half * speed)) + step / speed * FACE_OVERSHOOT
-        if CONTRACTED:
-            leave = tl.minimum(leave, reach * LONGEST_STEP)
-        t = tl.where(outside, tl.maximum(t + leave, t * LEAST_ADVANCE), t)
-        entered = entered | outside
+        t, _, _, _, outside = _skip(ox, oy, oz, dx, dy, dz, t, far, ahead, states, grid, half, extent, step, CONTRACTED)
+        came = came | outside
         ahead = outside & (t < far)
-    # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
-    t = tl.where(entered & (t < far), t + jitter * step / speed, t)
-    x, y, z, _ = contracted(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTED)
-    return t, x, y, z, reach, speed, state
+    tl.store(entries + i, t, mask=live)
+    tl.store(counts + i, -came.to(tl.int32), mask=live)
+    if tl.program_id(0) == 0:
+        tl.store(queue + tl.arange(0, 2), 0)
 
 
 @jit
 def march_kernel(  # type: ignore[no-untyped-def]
-    origins, directions, nears, fars, jitters, states, queue, found, counts, sharpness_at, step_at,
+    origins, directions, fars, jitters, states, queue, entries, found, counts, sharpness_at, step_at,
     scale, inner, outer, table, resolutions, offsets, hidden, output, rays, width, active, grid, extent,
     sphere_step_factor, min_slope, max_optical_depth,
-    CONTRACTED: tl.constexpr, UNITS: tl.constexpr, FEATURES: tl.constexpr, LANES: tl.constexpr, HIDDEN: tl.constexpr,
+    CONTRACTED: tl.constexpr, UNITS: tl.constexpr, FEATURES: tl.constexpr, SKIPS: tl.constexpr, LANES: tl.constexpr, HIDDEN: tl.constexpr,
 ):  # fmt: skip
     """See ``reference.march``.
 
-    queue: (2,) int32, zeros: the next ray, and samples of all rays. found: (3, MAX_SAMPLES, rays): ray distance of each sample, distance of
-    the surface, optical depth of the section that ends there. counts: (rays,) int32, samples.
+    queue: (2,) int32, zeros: the next ray, and what ``sections.weigh_kernel`` counts. entries, counts: of ``enter_kernel``; counts become
+    samples. found: (3, MAX_SAMPLES, rays): ray distance of each sample, distance of the surface, optical depth of the section that ends
+    there.
     """
     sharpness, step = tl.load(sharpness_at), tl.load(step_at).to(tl.float32)
     soft = (1.0 / sharpness * SOFT_SURFACE).to(tl.float32)
     half = 0.5 * grid / extent
     plane = rays * MAX_SAMPLES
     zero = tl.zeros([LANES], tl.float32)
-    idle = zero == 0.0
+    busy = zero != 0.0
+    came = busy
     ray = zero.to(tl.int32)
     k = ray
     ox, oy, oz, dx, dy, dz = zero, zero, zero, zero, zero, zero
     t, far, jitter, depth, t0, f0 = zero, zero, zero, zero, zero, zero
-    going = idle
-    samples = 0
-    while tl.max(going.to(tl.int32), 0) > 0:
+    while tl.max((ray < rays).to(tl.int32), 0) > 0:
+        idle = (ray < rays) & ~busy
         ray = tl.where(idle, tl.atomic_add(queue + tl.zeros([LANES], tl.int32), 1, mask=idle, sem="relaxed"), ray)
         fresh = idle & (ray < rays)
         nx, ny, nz = position(origins, ray, fresh)
@@ -131,13 +163,23 @@ def march_kernel(  # type: ignore[no-untyped-def]
         dx, dy, dz = tl.where(fresh, nx, dx), tl.where(fresh, ny, dy), tl.where(fresh, nz, dz)
         far = tl.where(fresh, tl.load(fars + ray, mask=fresh, other=0.0), far)
         jitter = tl.where(fresh, tl.load(jitters + ray, mask=fresh, other=0.0), jitter)
-        t = tl.where(fresh, tl.load(nears + ray, mask=fresh, other=0.0) + jitter * step, t)
+        t = tl.where(fresh, tl.load(entries + ray, mask=fresh, other=0.0), t)
+        came = tl.where(fresh, tl.load(counts + ray, mask=fresh, other=0) < 0, came)
         k = tl.where(fresh, 0, k)
         depth = tl.where(fresh, 0.0, depth)
         # lanes without a ray are where their last one ended, and stay
         t = tl.where(ray < rays, t, far)
-        t, x, y, z, reach, speed, state = _advance(ox, oy, oz, dx, dy, dz, t, far, jitter, states, grid, half, extent, step, CONTRACTED)
-        met = (ray < rays) & (t < far)
+        ahead = t < far
+        reach, speed, state = zero + 1.0, zero + 1.0, zero.to(tl.int32)
+        for _ in tl.static_range(SKIPS):
+            t, reach, speed, state, outside = _skip(ox, oy, oz, dx, dy, dz, t, far, ahead, states, grid, half, extent, step, CONTRACTED)
+            came = came | outside
+            ahead = outside & (t < far)
+        # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
+        t = tl.where(came & ~ahead & (t < far), t + jitter * step / speed, t)
+        came = came & ahead
+        x, y, z, _ = contracted(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTED)
+        met = (ray < rays) & (t < far) & ~ahead
         f = distance(x, y, z, met, table, resolutions, offsets, active, scale, hidden, width, output, inner, outer, UNITS, HIDDEN, FEATURES)
         later = met & (k > 0)
         tau = tl.where(later, optical_depth(f0, f, sharpness, k == 1), 0.0)
@@ -152,11 +194,8 @@ def march_kernel(  # type: ignore[no-untyped-def]
         if CONTRACTED:
             jump = tl.minimum(jump, reach * LONGEST_STEP)
         k += met.to(tl.int32)
-        samples += tl.sum(met.to(tl.int32), 0)
-        going = met & (depth <= max_optical_depth) & ~((state == SOLID) & later) & (k < MAX_SAMPLES)
-        tl.store(counts + ray, k, mask=(ray < rays) & ~going)
+        on = met & (depth <= max_optical_depth) & ~((state == SOLID) & later) & (k < MAX_SAMPLES)
         t0, f0 = tl.where(met, t, t0), tl.where(met, f, f0)
-        t = tl.where(going, t + jump, far)
-        idle = (ray < rays) & ~going
-        going = going | idle
-    tl.atomic_add(queue + 1, samples, sem="relaxed")
+        t = tl.where(on, t + jump, tl.where(ahead, t, far))
+        busy = on | ((ray < rays) & ahead)
+        tl.store(counts + ray, k, mask=(ray < rays) & ~busy)

@@ -23,13 +23,14 @@ def _opacity(tau):  # type: ignore[no-untyped-def]
 @jit
 def weigh_kernel(  # type: ignore[no-untyped-def]
     origins, directions, found, counts, sharpness_at, sections, section_k, section_count, second, touched, share, shown, distance, depth,
-    opacity, behind, rays, min_section_weight, max_optical_depth, CONTRACTED: tl.constexpr, LANES: tl.constexpr,
+    opacity, behind, samples, rays, min_section_weight, max_optical_depth, CONTRACTED: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Weights of sections, see ``reference.section_weights`` and ``composite``.
 
     sections: (2, MAX_SAMPLES, rays) of those that matter: ray distance where they cross the surface, weight; section_k: the samples with
     which they begin. section_count, second, touched: (rays,) int32: how many matter, the sample with which the second surface begins
-    (MAX_SAMPLES: none), how many samples have a gradient. share, shown, distance: (2 rays,). depth, opacity, behind: (rays,).
+    (MAX_SAMPLES: none), how many samples have a gradient. share, shown, distance: (2 rays,). depth, opacity, behind: (rays,). samples: of
+    all rays, added to what is there.
     """
     ray = tl.program_id(0) * LANES + tl.arange(0, LANES)
     live = ray < rays
@@ -96,6 +97,7 @@ def weigh_kernel(  # type: ignore[no-untyped-def]
     tl.store(depth + ray, half, mask=live)
     tl.store(opacity + ray, before, mask=live)
     tl.store(behind + ray, tl.where(two, rays + ray, -1).to(tl.int64), mask=live)
+    tl.atomic_add(samples, tl.sum(count, 0), sem="relaxed")
 
 
 @jit

@@ -53,9 +53,9 @@ HUBER, MOSTLY_BLOCKED = constant(constants.HUBER_DELTA), constant(constants.MOST
 COLUMNS = constant(16)  # features that are looked up together, the least depth of a matrix product on tensor cores
 
 
-def programs(device: torch.device) -> int:
+def programs(device: torch.device, per_core: int = _PROGRAMS_PER_CORE) -> int:
     """Programs of a persistent kernel: sums of as many parts are added in order, so a result depends on the kind of GPU alone."""
-    return 2 if device.type == "cpu" else _PROGRAMS_PER_CORE * torch.cuda.get_device_properties(device).multi_processor_count
+    return 2 if device.type == "cpu" else per_core * torch.cuda.get_device_properties(device).multi_processor_count
 
 
 def scalar(value: float | Tensor, device: torch.device) -> Tensor:

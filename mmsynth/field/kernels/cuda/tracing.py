@@ -1,4 +1,4 @@
-"""Rays through the field in Triton, behind torch's autograd: three kernels forward, four backward, no shape that the host has to ask for.
+"""Rays through the field in Triton, behind torch's autograd: four kernels forward, four backward, no shape that the host has to ask for.
 
 Hits have a row for the nearest surface of each ray and one for what is behind it, whether there is or not. Scratch has room for
 MAX_SAMPLES samples of each ray; only what is used of it is read or written.
@@ -15,7 +15,8 @@ from mmsynth.field.kernels.constants import MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cuda import sections
 from mmsynth.field.kernels.cuda.appearance import look_backward_kernel, look_kernel
 from mmsynth.field.kernels.cuda.marching import LANES as MARCH_LANES
-from mmsynth.field.kernels.cuda.marching import march_kernel
+from mmsynth.field.kernels.cuda.marching import OPTIONS as MARCH_OPTIONS
+from mmsynth.field.kernels.cuda.marching import PER_CORE, SKIPS, enter_kernel, march_kernel
 from mmsynth.field.kernels.cuda.shared import COLUMNS, programs, scalar, triton
 from mmsynth.field.kernels.cuda.surface import BLOCK, OPTIONS, RAYS, launch, padded_units, surface_backward, table_gradient
 from mmsynth.field.kernels.parameters import GridTable, Hits, Rays, Sampling, SurfaceNetwork
@@ -54,7 +55,7 @@ class _Trace(torch.autograd.Function):
         count, device, s = len(origins), origins.device, sampling
         (units, width), columns = hidden.shape, appearance.table.shape[1] * len(appearance.resolutions)
         new = lambda *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype, device=device)
-        queue = torch.zeros(2, dtype=torch.int32, device=device)
+        queue, entries = new(2, dtype=torch.int32) if count else torch.zeros(2, dtype=torch.int32, device=device), new(count)
         sharpness, step = scalar(s.sharpness, device), scalar(s.step, device)
         section_count, second, touched, counts = (new(count, dtype=torch.int32) for _ in range(4))
         section_k = new(MAX_SAMPLES_PER_RAY, count, dtype=torch.int32)
@@ -69,15 +70,20 @@ class _Trace(torch.autograd.Function):
         if count:
             blocks = triton.cdiv(count, LANES)
             with torch.cuda.device_of(origins):
-                march_kernel[(min(programs(device), triton.cdiv(count, MARCH_LANES)),)](
-                    origins, directions, near, far, jitter, states.contiguous(), queue, t.found, t.counts, sharpness, step,
+                states = states.contiguous()
+                enter_kernel[(blocks,)](
+                    origins, directions, near, far, jitter, states, queue, entries, t.counts, step, count, states.shape[0],
+                    float(grid.extent), bent, LANES, num_warps=1,
+                )  # fmt: skip
+                march_kernel[(min(programs(device, PER_CORE), triton.cdiv(count, MARCH_LANES)),)](
+                    origins, directions, far, jitter, states, queue, entries, t.found, t.counts, sharpness, step,
                     *launch(grid, network), count, width, grid.active, states.shape[0], float(grid.extent),
                     s.sphere_step_factor, s.min_slope, s.max_optical_depth,
-                    bent, units, grid.table.shape[1], MARCH_LANES, padded_units(units), **OPTIONS,
+                    bent, units, grid.table.shape[1], SKIPS, MARCH_LANES, padded_units(units), **MARCH_OPTIONS,
                 )  # fmt: skip
                 sections.weigh_kernel[(blocks,)](
                     origins, directions, t.found, t.counts, sharpness, t.sections, t.section_k, t.section_count, t.second, t.touched,
-                    share, t.shown, distance, depth, opacity, behind, count, s.min_section_weight, s.max_optical_depth,
+                    share, t.shown, distance, depth, opacity, behind, queue[1:], count, s.min_section_weight, s.max_optical_depth,
                     bent, LANES, num_warps=1,
                 )  # fmt: skip
                 look_kernel[(blocks, triton.cdiv(columns, COLUMNS.value))](
