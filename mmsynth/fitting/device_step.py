@@ -106,7 +106,7 @@ class DeviceStep:
     """
 
     samples, most_rays = SAMPLES_ON_GPU, MOST_RAYS
-    first_rays = SAMPLES_ON_GPU // 64  # a ray of the first step takes that many samples or more
+    first_rays = SAMPLES_ON_GPU // 16  # a ray of the first steps takes about as many samples; each other number has a graph of its own
 
     def __init__(
         self,

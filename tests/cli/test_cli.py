@@ -70,6 +70,23 @@ def scene(tmp_path: Path) -> Path:
     return Path(shutil.copytree(data_folder("example_scene"), tmp_path / "scene"))
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "evaluate",
+        "convert --from rgb --to ms",
+        "simulate --sensor mmsdata_rgb",
+        "calibrate-noise",
+        "mesh",
+        "video",
+        "view",
+        "generate-dataset",
+    ],
+)
+def test_a_device_that_is_none_is_refused_before_anything_is_opened(tmp_path: Path, command: str) -> None:
+    refused(here(tmp_path, *command.split(), "--device", "tpu"), "--device 'tpu': expected auto, cpu or cuda")
+
+
 def test_fit_leaves_a_run(fitted: Path) -> None:
     latest = fitted / "runs" / "latest"
     assert latest.resolve() == (fitted / "runs" / "example_scene").resolve()
