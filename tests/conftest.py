@@ -172,6 +172,11 @@ if INTERPRETED:
     interpreter._patch_lang_tensor = patch_tensor_and_index
     interpreter._patch_lang = patch_once
 
+    # a round takes it as long for one ray as for many
+    from mmsynth.field.kernels.cuda import tracing
+
+    tracing.MARCH_LANES = 128
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of the tests of Triton, those with a ``device`` need a GPU or the interpreter; the others have nothing to do with the interpreter.

@@ -14,7 +14,6 @@ from small_scenes import QUICK, around, write_scene
 
 from mmsynth.field import kernels
 from mmsynth.field.kernels import reference
-from mmsynth.field.kernels.cuda import tracing
 from mmsynth.fitting.device_step import DeviceStep
 from mmsynth.fitting.schedule import SurfaceRates, sampling_at
 from mmsynth.fitting.trainer import Trainer
@@ -22,12 +21,6 @@ from mmsynth.scene.load import load_scene
 
 # an operation of the interpreter takes as long for one number as for a block
 FEW = {"surface.levels": 3, "radiance.levels": 3, "loss.eikonal_points": 16, "sampling.initial_rays": 8, "sampling.occupancy_resolution": 8}
-
-
-@pytest.fixture(autouse=True)
-def _many_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For the same reason."""
-    monkeypatch.setattr(tracing, "MARCH_LANES", 128)
 
 
 def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
