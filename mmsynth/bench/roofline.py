@@ -144,8 +144,7 @@ def roofline_table(sizes: Sizes | None = None) -> Table:
         Column("Binds", "binds"), Column("Sum of slowest [µs]", "us", ".0f"), Column("Samples/s", "samples_per_s", ",.0f"),
     )  # fmt: skip
     note = (
-        "On paper. Disproved by a step that takes more than four times the sum (then it waits: occupancy, divergence "
-        "of rays, dependent loads), by less than 80 % of the tables' reads found in L2, or by a kernel that another limit binds when it is "
-        "measured."
+        "On paper. Disproved by a step that takes more than four times the sum (then it waits: occupancy, divergence of rays, dependent "
+        "loads), by less than 80 % of the tables' reads found in L2, or by a kernel that another limit binds when it is measured."
     )
     return Table("Roofline of a step", columns, rows(sizes), note)

@@ -65,8 +65,9 @@ def _leave(x, velocity, cell, half, extent):  # type: ignore[no-untyped-def]
 
 
 @jit
-def _look(ox, oy, oz, dx, dy, dz, t, states, grid, half, extent, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
-    """At t: cell, position and velocity in the frame of the grid, distance from the centre, speed, state."""
+def _skip(ox, oy, oz, dx, dy, dz, t, ahead, states, grid, half, extent, step, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """See ``reference._advance``: of the rays that are ``ahead`` of where they arrive, those in a free cell leave it. t, distance from
+    the centre, speed and state before, whether a ray left; of a ray that has arrived, this finds the same again."""
     x, y, z, reach = contracted(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTED)
     vx, vy, vz = dx, dy, dz
     if CONTRACTED:
@@ -80,14 +81,6 @@ def _look(ox, oy, oz, dx, dy, dz, t, states, grid, half, extent, CONTRACTED: tl.
     speed = tl.sqrt(vx * vx + vy * vy + vz * vz)
     ix, iy, iz = _cell(x, half, extent, grid), _cell(y, half, extent, grid), _cell(z, half, extent, grid)
     state = tl.load(states + (ix * grid + iy) * grid + iz).to(tl.int32)
-    return ix, iy, iz, x, y, z, vx, vy, vz, reach, speed, state
-
-
-@jit
-def _skip(ox, oy, oz, dx, dy, dz, t, far, ahead, states, grid, half, extent, step, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
-    """See ``reference._advance``: of the rays that are ``ahead`` of where they arrive, those in a free cell leave it. t, distance from
-    the centre, speed and state before, whether a ray left; of a ray that has arrived, this finds the same again."""
-    ix, iy, iz, x, y, z, vx, vy, vz, reach, speed, state = _look(ox, oy, oz, dx, dy, dz, t, states, grid, half, extent, CONTRACTED)
     outside = ahead & (state >= OUTSIDE)
     leave = tl.minimum(_leave(x, vx, ix, half, extent), _leave(y, vy, iy, half, extent))
     leave = tl.maximum(tl.minimum(leave, _leave(z, vz, iz, half, extent)), 0.0)
@@ -115,12 +108,11 @@ def enter_kernel(  # type: ignore[no-untyped-def]
     ox, oy, oz = position(origins, i, live)
     dx, dy, dz = position(directions, i, live)
     far = tl.load(fars + i, mask=live, other=0.0)
-    begin = tl.load(nears + i, mask=live, other=0.0) + tl.load(jitters + i, mask=live, other=0.0) * step
-    t = begin
+    t = tl.load(nears + i, mask=live, other=0.0) + tl.load(jitters + i, mask=live, other=0.0) * step
     ahead = live & (t < far)
     came = t < t
     while tl.max(ahead.to(tl.int32), 0) > 0:
-        t, _, _, _, outside = _skip(ox, oy, oz, dx, dy, dz, t, far, ahead, states, grid, half, extent, step, CONTRACTED)
+        t, _, _, _, outside = _skip(ox, oy, oz, dx, dy, dz, t, ahead, states, grid, half, extent, step, CONTRACTED)
         came = came | outside
         ahead = outside & (t < far)
     tl.store(entries + i, t, mask=live)
@@ -172,7 +164,7 @@ def march_kernel(  # type: ignore[no-untyped-def]
         ahead = t < far
         reach, speed, state = zero + 1.0, zero + 1.0, zero.to(tl.int32)
         for _ in tl.static_range(SKIPS):
-            t, reach, speed, state, outside = _skip(ox, oy, oz, dx, dy, dz, t, far, ahead, states, grid, half, extent, step, CONTRACTED)
+            t, reach, speed, state, outside = _skip(ox, oy, oz, dx, dy, dz, t, ahead, states, grid, half, extent, step, CONTRACTED)
             came = came | outside
             ahead = outside & (t < far)
         # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
