@@ -25,7 +25,6 @@ HostOption = Annotated[str, typer.Option(help="address to listen at; default: th
 def view(run: RunOption = None, port: PortOption = 8080, host: HostOption = "127.0.0.1", device: DeviceOption = "auto") -> None:
     """Look at a field in the browser; ctrl-c ends it."""
     from mmsynth.errors import InputError
-    from mmsynth.field.warmup import warm_up
     from mmsynth.fitting.device import pick_device
     from mmsynth.viewer.open import open_viewer, serve
     from mmsynth.viewer.viewer import require_free
@@ -40,8 +39,6 @@ def view(run: RunOption = None, port: PortOption = 8080, host: HostOption = "127
         folder, field = open_field(run, device=chosen)  # the field can be looked at without its scene
         scene = None
         print(f"note: {error} The field is shown without its frames.")
-    if chosen == "cpu":
-        warm_up()
     viewer = open_viewer(field, scene, folder, host=host, port=port)
     print(listening(viewer.url, host), flush=True)
     serve(viewer)
