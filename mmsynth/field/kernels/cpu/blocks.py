@@ -14,22 +14,39 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
-from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, HASH_PRIMES
+from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW
+from mmsynth.field.kernels.cpu.corners import (
+    AT_ONCE,
+    add_slopes,
+    find_corners,
+    find_weights,
+    of_axes,
+    of_corners,
+    places_of_corners,
+    same_cell,
+    to_unit,
+)
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, element, padded, splat, whole
 
-_P1 = np.uint32(HASH_PRIMES[1])
-_P2 = np.uint32(HASH_PRIMES[2])
 _VECTOR = ir.VectorType(ir.FloatType(), FEATURES)
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _CAREFUL = {"contract", "reassoc", "nsz", "arcp"}  # a gradient that is NaN is not 0
 
 
-def _row(context, builder, table_type, table, row):  # type: ignore[no-untyped-def]
-    data = builder.bitcast(context.make_array(table_type)(context, builder, table).data, ir.IntType(8).as_pointer())
-    offset = builder.mul(builder.zext(row, _I64), ir.Constant(_I64, 4 * FEATURES))
-    return builder.bitcast(builder.gep(data, [offset]), _VECTOR.as_pointer())
+def _row(context, builder, signature, args, table, corner):  # type: ignore[no-untyped-def]
+    """The address of the row of a corner: of arguments that begin with the table, ``places`` and the position's number there."""
+    data = builder.bitcast(context.make_array(signature.args[0])(context, builder, table).data, ir.IntType(8).as_pointer())
+    place = _at_corner(context, builder, signature.args[1], args[1], args[2], corner)
+    return builder.bitcast(builder.gep(data, [builder.zext(builder.load(place), _I64)]), _VECTOR.as_pointer())
+
+
+def _at_corner(context, builder, kind, array, position, corner):  # type: ignore[no-untyped-def]
+    """The address of a corner's number in an array of ``corners``."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.gep(data, [builder.add(position, ir.Constant(_I64, corner * AT_ONCE))])
 
 
 def _features(context, builder, signature, args, block, position, column):  # type: ignore[no-untyped-def]
@@ -39,105 +56,61 @@ def _features(context, builder, signature, args, block, position, column):  # ty
 
 
 @intrinsic
-def _mix(typingctx, table, rows, weights, block, position, column):  # type: ignore[no-untyped-def]
+def _mix(typingctx, table, places, i, weights, block, position, column):  # type: ignore[no-untyped-def]
     """Σ weight · row over eight corners, into the block."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         total = None
         for k in range(8):
-            row = _row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k))
-            weight = splat(builder, builder.extract_value(args[2], k), _VECTOR)
-            part = builder.fmul(builder.load(row, align=4), weight, flags=("fast",))
+            weight = builder.load(_at_corner(context, builder, signature.args[3], args[3], args[2], k))
+            row = builder.load(_row(context, builder, signature, args, args[0], k), align=4)
+            part = builder.fmul(row, splat(builder, weight, _VECTOR), flags=("fast",))
             total = part if total is None else builder.fadd(total, part, flags=("fast",))
-        builder.store(total, _features(context, builder, signature, args, 3, 4, 5), align=4)
+        builder.store(total, _features(context, builder, signature, args, 4, 5, 6), align=4)
         return context.get_dummy_value()
 
-    return types.void(table, rows, weights, block, position, column), codegen
+    return types.void(table, places, i, weights, block, position, column), codegen
 
 
 @intrinsic
-def _spread(typingctx, table, rows, weights, block, position, column):  # type: ignore[no-untyped-def]
-    """row += weight · gradient, which the block holds, at eight corners."""
+def _spread(typingctx, table, places, i, weights, block, position, column, count):  # type: ignore[no-untyped-def]
+    """row += Σ weight · gradient, which the block holds, at eight corners that so many positions share. The sums stay in registers: what
+    was stored a moment ago takes long to read."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        vector = builder.load(_features(context, builder, signature, args, 3, 4, 5), align=4)
-        for k in range(8):
-            row = _row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k))
-            part = builder.fmul(vector, splat(builder, builder.extract_value(args[2], k), _VECTOR), flags=("fast",))
-            builder.store(builder.fadd(builder.load(row, align=4), part, flags=("fast",)), row, align=4)
+        sums = [cgutils.alloca_once_value(builder, ir.Constant(_VECTOR, [0.0] * FEATURES)) for _ in range(8)]
+        with cgutils.for_range(builder, args[7]) as loop:
+            here = [*args[:5], builder.add(args[5], loop.index), args[6]]
+            vector = builder.load(_features(context, builder, signature, here, 4, 5, 6), align=4)
+            for k, total in enumerate(sums):
+                at = builder.add(args[2], loop.index)
+                weight = builder.load(_at_corner(context, builder, signature.args[3], args[3], at, k))
+                part = builder.fmul(vector, splat(builder, weight, _VECTOR), flags=("contract",))
+                builder.store(builder.fadd(builder.load(total), part, flags=("contract",)), total)
+        rows = [_row(context, builder, signature, args, args[0], k) for k in range(8)]
+        for row, total in zip(rows, sums, strict=True):
+            builder.store(builder.fadd(builder.load(row, align=4), builder.load(total)), row, align=4)
         return context.get_dummy_value()
 
-    return types.void(table, rows, weights, block, position, column), codegen
+    return types.void(table, places, i, weights, block, position, column, count), codegen
 
 
 @intrinsic
-def _dots(typingctx, table, rows, block, position, column):  # type: ignore[no-untyped-def]
-    """row · gradient, which the block holds, at eight corners: eight numbers."""
+def _dots(typingctx, table, places, i, values, block, position, column):  # type: ignore[no-untyped-def]
+    """row · gradient, which the block holds, at eight corners, into ``values``."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        vector = builder.load(_features(context, builder, signature, args, 2, 3, 4), align=4)
-        out = []
+        vector = builder.load(_features(context, builder, signature, args, 4, 5, 6), align=4)
         for k in range(8):
-            row = builder.load(_row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], k)), align=4)
+            row = builder.load(_row(context, builder, signature, args, args[0], k), align=4)
             product = builder.fmul(row, vector, flags=("fast",))
             total = ir.Constant(ir.FloatType(), 0.0)
             for j in range(FEATURES):
                 total = builder.fadd(total, builder.extract_element(product, ir.Constant(_I32, j)), flags=("fast",))
-            out.append(total)
-        return context.make_tuple(builder, signature.return_type, out)
+            builder.store(total, _at_corner(context, builder, signature.args[3], args[3], args[2], k))
+        return context.get_dummy_value()
 
-    return types.UniTuple(types.float32, 8)(table, rows, block, position, column), codegen
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _cell(x, scale, resolution):  # type: ignore[no-untyped-def]
-    """Cell index along one axis, where in the cell, for a coordinate of the grid's frame; places outside go to the border."""
-    unit = min(max(x * scale + np.float32(0.5), np.float32(0.0)), np.float32(1.0)) * np.float32(resolution)
-    index = min(np.int32(unit), resolution - np.int32(1))
-    return index, unit - np.float32(index)
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _corners(x, y, z, resolution, mask, dense):  # type: ignore[no-untyped-def]
-    """Table rows of the eight corners, z fastest (the order of ``_weights``)."""
-    if dense:
-        side = np.uint32(resolution + 1)
-        base = (np.uint32(x) * side + np.uint32(y)) * side + np.uint32(z)
-        right = base + side * side
-        one = np.uint32(1)
-        return base, base + one, base + side, base + side + one, right, right + one, right + side, right + side + one
-    x0, x1 = np.uint32(x), np.uint32(x + 1)
-    y0 = np.uint32(y) * _P1
-    y1 = y0 + _P1
-    z0 = np.uint32(z) * _P2
-    z1 = z0 + _P2
-    a, b, c, d = x0 ^ y0, x0 ^ y1, x1 ^ y0, x1 ^ y1
-    return (
-        (a ^ z0) & mask,
-        (a ^ z1) & mask,
-        (b ^ z0) & mask,
-        (b ^ z1) & mask,
-        (c ^ z0) & mask,
-        (c ^ z1) & mask,
-        (d ^ z0) & mask,
-        (d ^ z1) & mask,
-    )
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
-    one = np.float32(1.0)
-    gx, gy, gz = one - fx, one - fy, one - fz
-    a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
-    return a * gz, a * fz, b * gz, b * fz, c * gz, c * fz, d * gz, d * fz
-
-
-@njit(cache=True, inline="always", error_model="numpy")
-def _level(grid, level):  # type: ignore[no-untyped-def]
-    """Cells per axis, index mask, and whether the level is stored densely."""
-    resolution = np.int32(grid.resolutions[level])
-    rows = grid.offsets[level + 1] - grid.offsets[level]
-    return resolution, np.uint32(rows - 1), (np.int64(resolution) + 1) ** 3 <= rows
+    return types.void(table, places, i, values, block, position, column), codegen
 
 
 class SurfaceLayers(NamedTuple):
@@ -162,54 +135,56 @@ def surface_layers(network: Any) -> SurfaceLayers:
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def encode_block(block, n, grid):  # type: ignore[no-untyped-def]
     """Fill the features of n positions."""
-    scale = np.float32(0.5 / grid.extent)
-    for level in range(grid.active):
-        resolution, mask, dense = _level(grid, level)
-        part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
-        column = FIRST_FEATURE_ROW + FEATURES * level
-        for i in range(n):
-            x, fx = _cell(block[i, 0], scale, resolution)
-            y, fy = _cell(block[i, 1], scale, resolution)
-            z, fz = _cell(block[i, 2], scale, resolution)
-            _mix(part, _corners(x, y, z, resolution, mask, dense), _weights(fx, fy, fz), block, np.int64(i), np.int64(column))
+    unit, fractions, places, weights = of_axes(), of_axes(), places_of_corners(), of_corners()
+    for begin in range(0, n, AT_ONCE):
+        some = min(AT_ONCE, n - begin)
+        to_unit(block, begin, some, grid.extent, unit)
+        for level in range(grid.active):
+            part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
+            find_corners(some, unit, grid.resolutions[level], len(part), places, fractions)
+            find_weights(some, fractions, weights)
+            for i in range(some):
+                _mix(part, places, np.int64(i), weights, block, np.int64(begin + i), np.int64(FIRST_FEATURE_ROW + FEATURES * level))
 
 
 @njit(cache=True, fastmath=_CAREFUL, nogil=True, error_model="numpy")
 def scatter_block(block, n, grid, gradient, level):  # type: ignore[no-untyped-def]
     """Add the features of one level, which hold gradients now, to the gradient of its table."""
-    scale = np.float32(0.5 / grid.extent)
-    zero = np.float32(0.0)
-    resolution, mask, dense = _level(grid, level)
+    unit, fractions, places, weights = of_axes(), of_axes(), places_of_corners(), of_corners()
     part = gradient[grid.offsets[level] : grid.offsets[level + 1]]
     c = np.int64(FIRST_FEATURE_ROW + FEATURES * level)
-    for i in range(n):
-        if block[i, c] == zero and block[i, c + 1] == zero and block[i, c + 2] == zero and block[i, c + 3] == zero:
-            continue
-        x, fx = _cell(block[i, 0], scale, resolution)
-        y, fy = _cell(block[i, 1], scale, resolution)
-        z, fz = _cell(block[i, 2], scale, resolution)
-        _spread(part, _corners(x, y, z, resolution, mask, dense), _weights(fx, fy, fz), block, np.int64(i), c)
+    for begin in range(0, n, AT_ONCE):
+        some = min(AT_ONCE, n - begin)
+        to_unit(block, begin, some, grid.extent, unit)
+        find_corners(some, unit, grid.resolutions[level], len(part), places, fractions)
+        find_weights(some, fractions, weights)
+        i = 0
+        while i < some:
+            count = 1
+            while i + count < some and same_cell(places, i, i + count):
+                count += 1
+            _spread(part, places, np.int64(i), weights, block, np.int64(begin + i), c, np.int64(count))
+            i += count
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
 def position_block(block, n, grid, out):  # type: ignore[no-untyped-def]
     """Add the gradient to the positions that the features, which hold gradients now, imply: out (n, 3)."""
+    unit, fractions, places, values, slopes = of_axes(), of_axes(), places_of_corners(), of_corners(), of_axes()
     scale = np.float32(0.5 / grid.extent)
-    one = np.float32(1.0)
-    for level in range(grid.active):
-        resolution, mask, dense = _level(grid, level)
-        part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
-        slope = scale * np.float32(resolution)
-        column = np.int64(FIRST_FEATURE_ROW + FEATURES * level)
-        for i in range(n):
-            x, fx = _cell(block[i, 0], scale, resolution)
-            y, fy = _cell(block[i, 1], scale, resolution)
-            z, fz = _cell(block[i, 2], scale, resolution)
-            q0, q1, q2, q3, q4, q5, q6, q7 = _dots(part, _corners(x, y, z, resolution, mask, dense), block, np.int64(i), column)
-            gx, gy, gz = one - fx, one - fy, one - fz
-            out[i, 0] += slope * (gy * (gz * (q4 - q0) + fz * (q5 - q1)) + fy * (gz * (q6 - q2) + fz * (q7 - q3)))
-            out[i, 1] += slope * (gx * (gz * (q2 - q0) + fz * (q3 - q1)) + fx * (gz * (q6 - q4) + fz * (q7 - q5)))
-            out[i, 2] += slope * (gx * (gy * (q1 - q0) + fy * (q3 - q2)) + fx * (gy * (q5 - q4) + fy * (q7 - q6)))
+    for begin in range(0, n, AT_ONCE):
+        some = min(AT_ONCE, n - begin)
+        to_unit(block, begin, some, grid.extent, unit)
+        slopes[:] = np.float32(0.0)
+        for level in range(grid.active):
+            part = grid.table[grid.offsets[level] : grid.offsets[level + 1]]
+            find_corners(some, unit, grid.resolutions[level], len(part), places, fractions)
+            for i in range(some):
+                _dots(part, places, np.int64(i), values, block, np.int64(begin + i), np.int64(FIRST_FEATURE_ROW + FEATURES * level))
+            add_slopes(some, fractions, values, scale * np.float32(grid.resolutions[level]), slopes)
+        for i in range(some):
+            for axis in range(3):
+                out[begin + i, axis] += slopes[axis * AT_ONCE + i]
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
