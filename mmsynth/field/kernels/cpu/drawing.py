@@ -39,9 +39,11 @@ def _bits(key, number, purpose):  # type: ignore[no-untyped-def]
 def _first_above(ascending, begin, end, value):  # type: ignore[no-untyped-def]
     """The first of a range whose number is larger than ``value``."""
     length = end - begin
-    while length > 1:  # without a branch that nobody could predict
+    while length > 1:
         half = length // 2
-        begin += half if ascending[begin + half - 1] <= value else 0
+        # all ones where it is larger: without a branch that nobody could predict, which LLVM would make of a condition
+        larger = (np.int64(value) - np.int64(ascending[begin + half - 1])) >> 63
+        begin += half & ~larger
         length -= half
     return begin + (1 if length > 0 and ascending[begin] <= value else 0)
 
