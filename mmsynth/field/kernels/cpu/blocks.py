@@ -36,9 +36,9 @@ _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _CAREFUL = {"contract", "reassoc", "nsz", "arcp"}  # a gradient that is NaN is not 0
 
 
-def _row(context, builder, signature, args, table, corner):  # type: ignore[no-untyped-def]
+def _row(context, builder, signature, args, corner):  # type: ignore[no-untyped-def]
     """The address of the row of a corner: of arguments that begin with the table, ``places`` and the position's number there."""
-    data = builder.bitcast(context.make_array(signature.args[0])(context, builder, table).data, ir.IntType(8).as_pointer())
+    data = builder.bitcast(context.make_array(signature.args[0])(context, builder, args[0]).data, ir.IntType(8).as_pointer())
     place = _at_corner(context, builder, signature.args[1], args[1], args[2], corner)
     return builder.bitcast(builder.gep(data, [builder.zext(builder.load(place), _I64)]), _VECTOR.as_pointer())
 
@@ -63,7 +63,7 @@ def _mix(typingctx, table, places, i, weights, block, position, column):  # type
         total = None
         for k in range(8):
             weight = builder.load(_at_corner(context, builder, signature.args[3], args[3], args[2], k))
-            row = builder.load(_row(context, builder, signature, args, args[0], k), align=4)
+            row = builder.load(_row(context, builder, signature, args, k), align=4)
             part = builder.fmul(row, splat(builder, weight, _VECTOR), flags=("fast",))
             total = part if total is None else builder.fadd(total, part, flags=("fast",))
         builder.store(total, _features(context, builder, signature, args, 4, 5, 6), align=4)
@@ -80,14 +80,13 @@ def _spread(typingctx, table, places, i, weights, block, position, column, count
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         sums = [cgutils.alloca_once_value(builder, ir.Constant(_VECTOR, [0.0] * FEATURES)) for _ in range(8)]
         with cgutils.for_range(builder, args[7]) as loop:
-            here = [*args[:5], builder.add(args[5], loop.index), args[6]]
-            vector = builder.load(_features(context, builder, signature, here, 4, 5, 6), align=4)
+            at, position = builder.add(args[2], loop.index), builder.add(args[5], loop.index)
+            vector = builder.load(_features(context, builder, signature, [*args[:5], position, args[6]], 4, 5, 6), align=4)
             for k, total in enumerate(sums):
-                at = builder.add(args[2], loop.index)
                 weight = builder.load(_at_corner(context, builder, signature.args[3], args[3], at, k))
                 part = builder.fmul(vector, splat(builder, weight, _VECTOR), flags=("contract",))
                 builder.store(builder.fadd(builder.load(total), part, flags=("contract",)), total)
-        rows = [_row(context, builder, signature, args, args[0], k) for k in range(8)]
+        rows = [_row(context, builder, signature, args, k) for k in range(8)]
         for row, total in zip(rows, sums, strict=True):
             builder.store(builder.fadd(builder.load(row, align=4), builder.load(total)), row, align=4)
         return context.get_dummy_value()
@@ -102,7 +101,7 @@ def _dots(typingctx, table, places, i, values, block, position, column):  # type
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         vector = builder.load(_features(context, builder, signature, args, 4, 5, 6), align=4)
         for k in range(8):
-            row = builder.load(_row(context, builder, signature, args, args[0], k), align=4)
+            row = builder.load(_row(context, builder, signature, args, k), align=4)
             product = builder.fmul(row, vector, flags=("fast",))
             total = ir.Constant(ir.FloatType(), 0.0)
             for j in range(FEATURES):

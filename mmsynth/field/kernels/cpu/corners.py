@@ -1,7 +1,8 @@
 """Corners of the cells of a hash grid: which rows of a table they are, and their weights, of ``AT_ONCE`` positions together.
 
-Row numbers are much integer arithmetic for each corner. Found position by position they took longer than reading the rows; as vectors over
-positions they take a fifth of that. Arrays have a part of ``AT_ONCE`` for each axis or corner, z fastest, and lie on the stack.
+Row numbers are much integer arithmetic for each corner: position by position it is most of a look-up's instructions, as vectors over
+positions few of them. Arrays have a part of ``AT_ONCE`` for each axis or corner, z fastest, and lie on the stack. Where both kinds of level
+set fractions stays written out: through one function LLVM makes no vectors of either (1.2 → 5.6 ns a position).
 """
 
 from __future__ import annotations
