@@ -1,4 +1,5 @@
-"""Points of pictures and their matches, in COLMAP's database: SIFT, pairs that are likely to match, and verification by epipolar geometry.
+"""Points of pictures and their matches, in COLMAP's database: SIFT, pairs that are likely to match, nearest descriptors, and verification
+by epipolar geometry.
 
 Needs pycolmap (``pip install 'mmsynth[capture]'``), which ``load_pycolmap`` alone imports.
 """
@@ -16,6 +17,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.scene.capture.likely_pairs import likely_pairs
+from mmsynth.scene.capture.nearest import mutual_matches
 from mmsynth.sensors.camera import Camera
 
 _THREADS = 2
@@ -54,6 +56,14 @@ class Picture:
         return self.sensor, self.view
 
 
+@dataclass(frozen=True)
+class _Features:
+    """Of a picture: descriptors (N, 128) uint8, scales (N,) px."""
+
+    descriptors: np.ndarray
+    scales: np.ndarray
+
+
 def load_pycolmap() -> Any:
     """The library, silenced, with its seed set. Raises InputError where it is missing."""
     try:
@@ -89,10 +99,11 @@ def match_pictures(
     database = work / "database.db"
     ids = _import(pycolmap, database, folder, pictures)
     _extract(pycolmap, database, folder, pictures)
-    counts = _features(pycolmap, database, ids)
     if rig is not None:
         _apply_rig(pycolmap, database, rig)
-    return database, counts, _match(pycolmap, database, work, pictures, ids)
+    features = _features(pycolmap, database, ids)
+    counts = {shot: len(found.scales) for shot, found in features.items()}
+    return database, counts, _match(pycolmap, database, pictures, ids, features)
 
 
 def _import(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[Picture]) -> dict[Shot, int]:
@@ -140,11 +151,15 @@ def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[Pic
     pycolmap.extract_features(database, folder, [p.file for p in pictures], extraction_options=options, device=pycolmap.Device.cpu)
 
 
-def _features(pycolmap: Any, database: Path, ids: Mapping[Shot, int]) -> dict[Shot, int]:
+def _features(pycolmap: Any, database: Path, ids: Mapping[Shot, int]) -> dict[Shot, _Features]:
     opened = pycolmap.Database.open(database)
-    counts = {shot: int(opened.num_keypoints_for_image(number)) for shot, number in ids.items()}
+    out = {}
+    for shot, number in ids.items():
+        points = np.asarray(opened.read_keypoints(number)).reshape(-1, 6)  # x, y and the four numbers of an affine shape
+        scales = np.sqrt(np.abs(points[:, 2] * points[:, 5] - points[:, 3] * points[:, 4]))
+        out[shot] = _Features(np.asarray(opened.read_descriptors(number).data, dtype=np.uint8), scales)
     opened.close()
-    return counts
+    return out
 
 
 def _apply_rig(pycolmap: Any, database: Path, rig: Mapping[str, np.ndarray]) -> None:
@@ -159,56 +174,49 @@ def _apply_rig(pycolmap: Any, database: Path, rig: Mapping[str, np.ndarray]) -> 
     opened.close()
 
 
-def _match(pycolmap: Any, database: Path, work: Path, pictures: Sequence[Picture], ids: Mapping[Shot, int]) -> Links:
+def _match(
+    pycolmap: Any, database: Path, pictures: Sequence[Picture], ids: Mapping[Shot, int], features: Mapping[Shot, _Features]
+) -> Links:
     """Match the reference sensor's pictures, then those of others where the reference's show the same; gives inliers of pairs."""
-    by_sensor: dict[str, list[Picture]] = defaultdict(list)
-    for picture in pictures:
-        by_sensor[picture.sensor].append(picture)
-    reference = pictures[0].sensor
-    _match_pairs(pycolmap, database, work, _pairs(pycolmap, database, by_sensor[reference], ids))
+    shots = [picture.shot for picture in pictures]
+    reference = shots[0][0]
+    of_reference = [shot for shot in shots if shot[0] == reference]
+    likely = likely_pairs([features[shot].descriptors for shot in of_reference], [features[shot].scales for shot in of_reference])
+    _match_pairs(pycolmap, database, [(of_reference[i], of_reference[j]) for i, j in likely], ids, features)
     links = _inliers(pycolmap, database, ids)
-    if len(by_sensor) > 1 and links:
+    if len(of_reference) < len(shots) and links:
         near: dict[int, set[int]] = defaultdict(set)
-        for view in {picture.view for picture in pictures}:
+        for view in {view for _, view in shots}:
             of_view = sorted(
                 ((count, b[1] if a[1] == view else a[1]) for (a, b), count in links.items() if view in (a[1], b[1])), reverse=True
             )
             near[view] = {view} | {other for _, other in of_view[:_LINKS]}
-        _match_pairs(pycolmap, database, work, list(_across(pictures, near, reference)))
+        _match_pairs(pycolmap, database, list(_across(shots, near)), ids, features)
         links = _inliers(pycolmap, database, ids)
     return links
 
 
-def _pairs(pycolmap: Any, database: Path, pictures: Sequence[Picture], ids: Mapping[Shot, int]) -> list[tuple[str, str]]:
-    """Of one sensor: files that are likely to show the same."""
+def _across(shots: Sequence[Shot], near: Mapping[int, set[int]]) -> Iterable[tuple[Shot, Shot]]:
+    """Pairs of pictures of views that see the same, but for the reference's own: the first one's sensor."""
+    reference = shots[0][0]
+    for i, a in enumerate(shots):
+        for b in shots[i + 1 :]:
+            if (a[0] != reference or b[0] != reference) and (b[1] in near[a[1]] or a[1] in near[b[1]]):
+                yield a, b
+
+
+def _match_pairs(
+    pycolmap: Any, database: Path, pairs: Iterable[tuple[Shot, Shot]], ids: Mapping[Shot, int], features: Mapping[Shot, _Features]
+) -> None:
+    """Write matches of pairs, and which of them agree on where the pictures were taken from."""
     opened = pycolmap.Database.open(database)
-    descriptors = [np.asarray(opened.read_descriptors(ids[picture.shot]).data) for picture in pictures]
-    scales = [_scales(np.asarray(opened.read_keypoints(ids[picture.shot]))) for picture in pictures]
+    for a, b in pairs:
+        opened.write_matches(ids[a], ids[b], mutual_matches(features[a].descriptors, features[b].descriptors))
     opened.close()
-    return [(pictures[i].file, pictures[j].file) for i, j in likely_pairs(descriptors, scales)]
-
-
-def _scales(keypoints: np.ndarray) -> np.ndarray:
-    """Of keypoints as rows x, y and the four numbers of an affine shape."""
-    return np.asarray(np.sqrt(np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])))
-
-
-def _across(pictures: Sequence[Picture], near: Mapping[int, set[int]], reference: str) -> Iterable[tuple[str, str]]:
-    """Pairs of pictures of views that see the same, but for the reference's own."""
-    for i, a in enumerate(pictures):
-        for b in pictures[i + 1 :]:
-            if (a.sensor != reference or b.sensor != reference) and (b.view in near[a.view] or a.view in near[b.view]):
-                yield a.file, b.file
-
-
-def _match_pairs(pycolmap: Any, database: Path, work: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    listed = work / "pairs.txt"
-    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-    matching = pycolmap.FeatureMatchingOptions(num_threads=_THREADS, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    pycolmap.match_image_pairs(
-        database, matching, pycolmap.ImportedPairingOptions(match_list_path=listed), verification, device=pycolmap.Device.cpu
+    pycolmap.geometric_verification(
+        database, pycolmap.GeometricVerifierOptions(num_threads=_THREADS), two_view_geometry_options=verification
     )
 
 
