@@ -33,11 +33,15 @@ class Importance:
         self.selection, self.first_tile, self.evenly = even, first_tile.cpu(), evenly  # numbers that the host asks for
         self.residuals = even.weight.new_ones(len(even.weight))
 
-    def renew(self, held: Tensor | None = None) -> None:
-        """Draw from now on by what was learned until now, and nothing of the tiles ``held`` (T,) bool."""
+    def renewed(self, held: Tensor | None = None) -> kernels.Selection:
+        """How to draw by what was learned until now, and nothing of the tiles ``held`` (T,) bool."""
         pixels = self.selection.pixels if held is None else self.selection.pixels * ~held
         ends, weight = kernels.odds(self.residuals, pixels, self.first_tile, self.evenly)
-        self.selection = self.selection._replace(ends=ends, weight=weight)
+        return self.selection._replace(ends=ends, weight=weight)
+
+    def renew(self, held: Tensor | None = None) -> None:
+        """Draw so from now on."""
+        self.selection = self.renewed(held)
 
     def learn(self, tile: Tensor, residual: Tensor) -> None:
         """Take in the relative residuals of rays that were drawn, (R,) each."""

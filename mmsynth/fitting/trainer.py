@@ -102,6 +102,8 @@ class Trainer:
         self.settled: tuple[Any, ...] = ()  # by the last step: what is not learned but decided
         self.coming: DrawnStep | None = None
         self.arranged: tuple[ToDraw, kernels.Arranged] | None = None  # the next step, if nothing has changed since that it follows from
+        self.renewed: kernels.Selection | None = None  # where rays go from the next step on, if that is due then
+        self.spent: tuple[Any, ...] = ()  # of the last step: many small arrays, which take their time to free
         self.points = eikonal_points(recipe, shines=False)  # those near what rays meet are left out where it shines
         self.parts: dict[str, Any] = {
             "field": self.field,
@@ -155,13 +157,17 @@ class Trainer:
         rays, state.rays, errors = state.rays, state.rays_after, dict[str, float]()
 
         def meanwhile(learned: kernels.Learned) -> None:
+            self.spent = ()
             self.coming = drawn_step(self.field, self.measurements, asked, learned.drawn)
             if math.isfinite(learned.loss):
                 errors.update(self._errors(drawn.batch, learned.squared))
             state.rays_after = self._adapted(rays, samples_of_step(done, self.recipe), int(learned.samples), _MOST_RAYS)
+            if (state.step + 1) % _RENEW_EVERY == 0:
+                self.renewed = self.importance.renewed(self._held_at(self._progress_at(state.step + 1)))
             self.arranged = self._arrange(self.coming, state.step + 1)
 
         learned = kernels.learn(arranged, lambda: self._update(sampling), meanwhile)
+        self.spent = drawn, asked, arranged
         wrong = self._wrong(learned)
         if wrong is not None:
             self._skip(wrong)
@@ -221,11 +227,13 @@ class Trainer:
             share = 1.0 if state.step == 0 else 1 / 16
             if not field.occupancy.update(field.surface.at(sampling.active_surface), sampling.sharpness, generator, share):
                 state.reopened += 1
-        on_trial = self.recipe.radiance.view_dependence == "auto" and schedule.view_dependence_from <= self.progress
-        held = self.held if on_trial and state.decided is None else None
+        held = self._held_at(self.progress)
         if state.step % _RENEW_EVERY == 0:
-            self.importance.renew(held)
-            self.arranged = None
+            if self.renewed is None:
+                self.importance.renew(held)
+                self.arranged = None
+            else:
+                self.importance.selection, self.renewed = self.renewed, None
         if state.tables is None and 0 < schedule.tables_at <= self.progress:
             state.tables = size_tables(field, self.recipe, sampling, generator)
             self._resize_tables(state.tables, generator)
@@ -255,6 +263,11 @@ class Trainer:
             if self.on_device is not None:
                 self.on_device.renew()
 
+    def _held_at(self, progress: float) -> torch.Tensor | None:
+        """Tiles of the views that are held out while directions are on trial."""
+        on_trial = self.recipe.radiance.view_dependence == "auto" and self.recipe.schedule.view_dependence_from <= progress
+        return self.held if on_trial and self.state.decided is None else None
+
     def _random(self, step: int) -> tuple[np.random.Generator, torch.Generator]:
         """The random numbers of a step."""
         random = np.random.default_rng((self.seed, 1, step))
@@ -265,7 +278,8 @@ class Trainer:
         random, generator = self._random(step)
         total = sum(self.needs.share.values())
         counts = {n: max(1, int(rays * share / total)) for n, share in self.needs.share.items()}
-        of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, self.importance.selection)
+        selection = self.importance.selection if self.renewed is None else self.renewed
+        of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, selection)
         if not self.has_empty:
             return ToDraw(counts, (of_pixels,), self.points, generator)
         # rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the object's, or
@@ -421,7 +435,7 @@ class Trainer:
         for name, part in self.parts.items():
             part.load_state_dict(saved[name])
         self.log_gain.data.copy_(saved["log_gain"])
-        self.coming = self.arranged = None
+        self.coming = self.arranged = self.renewed = None
         if self.on_device is not None:
             self.on_device.resume()
         if self.state.decided is not None:

@@ -124,11 +124,17 @@ class SurfaceLayers(NamedTuple):
 
 def surface_layers(network: Any) -> SurfaceLayers:
     """Of a ``SurfaceNetwork`` of arrays."""
-    units, inputs = network.hidden.shape
-    hidden = padded(network.hidden, columns=FIRST_FEATURE_ROW + whole.py_func(inputs - FIRST_FEATURE_ROW, TILE_COLS))
-    output = np.zeros(len(hidden) + 1, np.float32)
-    output[:units], output[-1] = network.output[:units], network.output[units]
-    return SurfaceLayers(hidden, np.ascontiguousarray(hidden.T), output, network.inner_radius, network.outer_radius)
+    hidden, turned, output = surface_weights(network.hidden, network.output)
+    return SurfaceLayers(hidden, turned, output, network.inner_radius, network.outer_radius)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def surface_weights(hidden, output):  # type: ignore[no-untyped-def]
+    """The arrays of ``SurfaceLayers``."""
+    units, tiles = hidden.shape[0], padded(hidden, FIRST_FEATURE_ROW)
+    out = np.zeros(tiles.shape[0] + 1, np.float32)
+    out[:units], out[-1] = output[:units], output[units]
+    return tiles, np.ascontiguousarray(tiles.T), out
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")

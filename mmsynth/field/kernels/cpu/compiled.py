@@ -5,7 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mmsynth.field.kernels.cpu import drawing, learning, marching, mirroring, optimiser, shading, surface, tracing_gradients
+from mmsynth.field.kernels.cpu import (
+    blocks,
+    drawing,
+    learning,
+    marching,
+    mirroring,
+    mirrors,
+    optimiser,
+    shading,
+    surface,
+    tracing_gradients,
+)
 from mmsynth.field.kernels.cpu.caching import publish, remove_old_versions
 
 KERNELS = (
@@ -13,6 +24,7 @@ KERNELS = (
     marching.trace_forward, tracing_gradients.trace_backward, tracing_gradients.trace_rays_backward, tracing_gradients.trace_scatter,
     shading.compare, shading.shade, mirroring.mirror, mirroring.mirror_backward, mirroring.reflect,
     learning.learn_rays, learning.finish, drawing.draw_rays, drawing.fill_odds, optimiser.adam_tensor,
+    blocks.surface_weights, shading.two_layers, mirrors.lamps_and_layers,
 )  # fmt: skip
 
 

@@ -137,9 +137,10 @@ def whole(count, of):  # type: ignore[no-untyped-def]
     return (count + of - 1) // of * of
 
 
-def padded(matrix: np.ndarray, columns: int | None = None) -> np.ndarray:
-    """A copy of whole tiles, whichever way round it is used, or of so many columns."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def padded(matrix, first=0):  # type: ignore[no-untyped-def]
+    """A copy of whole tiles, whichever way round it is used; of the columns those behind the ``first``."""
     rows, width = matrix.shape
-    out = np.zeros((whole.py_func(rows, TILE_COLS), whole.py_func(width, TILE_COLS) if columns is None else columns), np.float32)
+    out = np.zeros((whole(rows, TILE_COLS), first + whole(width - first, TILE_COLS)), np.float32)
     out[:rows, :width] = matrix
     return out

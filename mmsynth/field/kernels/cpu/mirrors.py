@@ -13,9 +13,9 @@ from mmsynth.field.kernels.cpu import mirroring
 from mmsynth.field.kernels.cpu.marching import CHUNK, contract, velocity
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, whole
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
-from mmsynth.field.kernels.cpu.shading import layer, layer_backward
+from mmsynth.field.kernels.cpu.shading import layer, layer_backward, two_layers
 from mmsynth.field.kernels.cpu.slopes import pull_to_one, slopes, slopes_backward
-from mmsynth.field.kernels.parameters import Mirrors
+from mmsynth.field.kernels.parameters import Lamps, Mirrors
 
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
@@ -53,6 +53,15 @@ class ChunkScratch(NamedTuple):
     y: np.ndarray
     gy: np.ndarray
     gh: np.ndarray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lamps_and_layers(light):  # type: ignore[no-untyped-def]
+    """Of a ``LightNetwork``: which outputs of its last layer there are (5 + K,), the lamps that there are, its layers with these."""
+    parts = len(light.second_bias) - len(light.position)
+    columns = np.concatenate((np.arange(parts), parts + light.used))
+    lamps = Lamps(light.position[light.used], np.exp(light.log_spectrum[light.used]))
+    return columns, lamps, two_layers(light.first, light.first_bias, light.second[columns], light.second_bias[columns])
 
 
 class LightOut(NamedTuple):

@@ -238,7 +238,7 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
         return reference.shade(weights, features, directions, degrees)
     outputs = torch.empty(len(features), len(weights.heads_bias))
     layers, heads, biases = shader_layers(as_arrays(weights))
-    shading.shade(as_array(features), as_array(directions), degrees, layers, padded(heads.T), biases, outputs.numpy())
+    shading.shade(as_array(features), as_array(directions), degrees, layers, padded.py_func(heads.T), biases, outputs.numpy())
     return outputs
 
 

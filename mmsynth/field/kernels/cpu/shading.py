@@ -195,7 +195,8 @@ class Layers(NamedTuple):
     second_bias: np.ndarray
 
 
-def two_layers(first: np.ndarray, first_bias: np.ndarray, second: np.ndarray, second_bias: np.ndarray) -> Layers:
+@njit(cache=True, nogil=True, error_model="numpy")
+def two_layers(first, first_bias, second, second_bias):  # type: ignore[no-untyped-def]
     """Weights (units, inputs) and biases as the kernels take them."""
     return Layers(padded(first), padded(first.T), first_bias, padded(second), padded(second.T), second_bias)
 

@@ -16,12 +16,12 @@ from mmsynth.field.kernels.cpu.blocks import surface_layers
 from mmsynth.field.kernels.cpu.drawing import ToFill, nothing_to_draw, to_fill
 from mmsynth.field.kernels.cpu.learning import WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
+from mmsynth.field.kernels.cpu.mirrors import lamps_and_layers
 from mmsynth.field.kernels.cpu.optimiser import places_and_numbers
-from mmsynth.field.kernels.cpu.shading import two_layers
 from mmsynth.field.kernels.cpu.stores import chunk_scratch, light_out, ray_store, shading_store, table_store, tap_store
 from mmsynth.field.kernels.cpu.tasks import take_beside
 from mmsynth.field.kernels.learning import gradient_of, no_light
-from mmsynth.field.kernels.parameters import AdamPart, Arranged, Drawing, Lamps, Learned, Step
+from mmsynth.field.kernels.parameters import AdamPart, Arranged, Drawing, Learned, Step
 
 
 class _Made(NamedTuple):
@@ -53,10 +53,7 @@ def learn(
     tasks = chunks + -(-points // slopes.POINTS)
     units, levels = len(network.hidden), len(table.resolutions)
     features, hidden, used = FEATURES * len(look.resolutions), len(light.first), light.used
-    parts = len(light.second_bias) - len(light.position)
-    columns = np.concatenate([np.arange(parts), parts + used])
-    lamps = Lamps(light.position[used], np.exp(light.log_spectrum[used]))
-    shining = two_layers(light.first, light.first_bias, light.second[columns], light.second_bias[columns])
+    columns, lamps, shining = lamps_and_layers(light)
     gain = np.empty(0, np.float32)
     if len(gains.log_gain):
         of_frames = np.exp(gains.log_gain - np.mean(gains.log_gain, dtype=np.float64)).astype(np.float32)
