@@ -45,8 +45,4 @@ def selections(measurements: Measurements, held: Tensor | None) -> tuple[kernels
         not_judging[begin:end] &= held[begin:end].any()
     even = Importance(chosen, first_tile, evenly=1.0)
 
-    def all_but(tiles: Tensor) -> kernels.Selection:
-        even.renew(tiles)
-        return even.selection
-
-    return all_but(held), all_but(not_judging)
+    return even.renewed(held), even.renewed(not_judging)

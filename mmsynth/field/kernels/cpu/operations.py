@@ -20,7 +20,6 @@ from mmsynth.field.kernels.cpu import marching, mirroring, shading, surface, tra
 from mmsynth.field.kernels.cpu.arrays import as_array, as_arrays, in_double, shader_layers
 from mmsynth.field.kernels.cpu.blocks import surface_layers
 from mmsynth.field.kernels.cpu.marching import CHUNK
-from mmsynth.field.kernels.cpu.matrices import padded
 from mmsynth.field.kernels.cpu.stores import (
     RayStore,
     SurfaceStore,
@@ -237,8 +236,7 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     if isinstance(degrees, Tensor) or torch.is_grad_enabled():
         return reference.shade(weights, features, directions, degrees)
     outputs = torch.empty(len(features), len(weights.heads_bias))
-    layers, heads, biases = shader_layers(as_arrays(weights))
-    shading.shade(as_array(features), as_array(directions), degrees, layers, padded.py_func(heads.T), biases, outputs.numpy())
+    shading.shade(as_array(features), as_array(directions), degrees, *shader_layers(as_arrays(weights)), outputs.numpy())
     return outputs
 
 

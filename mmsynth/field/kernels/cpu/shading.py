@@ -307,7 +307,7 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def shade(features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """See ``reference.shade``, of rays that all have one degree."""
-    rays = len(features)
+    rays, turned = len(features), padded(heads.T)
     for task in prange((rays + CHUNK - 1) // CHUNK):
         begin = np.int64(task) * CHUNK
-        _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, heads, heads_bias, outputs)
+        _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, turned, heads_bias, outputs)
