@@ -261,14 +261,14 @@ OPERATIONS: tuple[Operation, ...] = (
     Operation(
         "surface_value",
         _surface_inputs,
-        {"torch": _surface(reference), "numba": _surface(cpu), "triton": _surface(cuda)},
+        {"torch": _surface(reference), "numba": _surface(cpu), "torch cuda": _surface(reference), "triton": _surface(cuda)},
         leaves=lambda x: list(x["surface"].parameters()),
         traffic=_surface_traffic,
     ),
     Operation(
         "trace",
         lambda samples: _rays(samples) | _field(),
-        {"torch": _trace(reference), "numba": _trace(cpu), "triton": _trace(cuda)},
+        {"torch": _trace(reference), "numba": _trace(cpu), "torch cuda": _trace(reference), "triton": _trace(cuda)},
         leaves=lambda x: [*x["surface"].parameters(), x["appearance"].table],
         count=lambda output: int(output[1]),
     ),

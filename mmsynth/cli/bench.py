@@ -89,7 +89,8 @@ def bench_size(
     from mmsynth.workflows.runs import open_run
 
     times, wanted = [seconds_of(text, "--budgets") for text in budgets.split(",")], fractions(scales, "--scales")
-    used, opened = load_recipe(recipe), open_run(run)
+    used, chosen = load_recipe(recipe), pick_device(device)
+    opened = open_run(run, device=chosen)
     with progress_bar("scenes", as_json) as show:
         scenes = make_scenes(opened.field, opened.scene, wanted, out, views=views, progress=show)
     if scenes_only:
@@ -98,7 +99,7 @@ def bench_size(
         return
     del opened  # the fits need the memory
     with progress_bar("bench size", as_json) as show:
-        report = measure(scenes, times, out, used, seed, show, pick_device(device))
+        report = measure(scenes, times, out, used, seed, show, chosen)
     print_report(report, as_json)
 
 

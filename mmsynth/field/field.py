@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -30,13 +30,16 @@ from mmsynth.field.tiles import side_by_side
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
-from mmsynth.sensors.camera import Camera, rays_by_parts
+from mmsynth.sensors.camera import Camera, rays_of_pixels
 from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 
 TILE, _ON_GPU = 8192, 1 << 17  # rays at a time: what they need stays in the caches; of a GPU fewer leave most idle
-_AT_ONCE = 1 << 18  # rays that are made together
 MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
+
+
+P = TypeVar("P")
+T = TypeVar("T")
 
 
 class Field(nn.Module):
@@ -360,14 +363,13 @@ class Field(nn.Module):
         """
         size = self.tile
         tiles = ((index[i : i + size], rays[i : i + size]) for index, rays in parts for i in range(0, len(index), size))
-        cast = lambda tile: self.cast(tile[1], camera_to_world, modalities, geometry, light)
-        found = side_by_side(cast, tiles) if self.device.type == "cpu" else ((tile, cast(tile)) for tile in tiles)
-        for (index, _), seen in found:
-            yield index, seen
+        cast = lambda tile: (tile[0], self.cast(tile[1], camera_to_world, modalities, geometry, light))
+        return _of_tiles(self.device, cast, tiles)
 
-    def rays_of(self, directions: np.ndarray, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    def rays_of(self, directions: np.ndarray | Tensor, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""
-        turned = torch.from_numpy((directions @ camera_to_world[:3, :3].T).astype(np.float32)).to(self.device)
+        to_world = torch.as_tensor(camera_to_world[:3, :3].T.astype(np.float64), device=self.device)
+        turned = (torch.as_tensor(directions, dtype=torch.float64, device=self.device) @ to_world).float()
         origin = self.to_normalised(camera_to_world[:3, 3]).expand(len(turned), 3)
         return origin, turned, torch.from_numpy(camera_to_world[:3, 0].astype(np.float32)).to(self.device).expand(len(turned), 3)
 
@@ -393,23 +395,26 @@ class Field(nn.Module):
         pose = np.asarray(camera_to_world, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError(f"pose: expected a finite 4x4 camera_to_world matrix, found shape {pose.shape} or NaN in it.")
-        pixels, valid = camera.width * camera.height, np.zeros(camera.width * camera.height, bool)
+        pixels, tile = camera.width * camera.height, self.tile
         images: dict[str, np.ndarray] = {}
-        forward = np.zeros(pixels, np.float32)
+        valid, forward = np.zeros(pixels, bool), np.zeros(pixels, np.float32)
 
-        def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            """Rays by parts: those of a whole picture of a full-size sensor would take more memory than what they show."""
-            for index, in_camera in rays_by_parts(camera, _AT_ONCE):
-                valid[index], forward[index] = True, in_camera[:, 2]
-                yield index, in_camera
+        def seen(begin: int) -> tuple[slice, np.ndarray, Tensor, dict[str, Tensor]]:
+            """Of the pixels of a tile: which have a ray, how far each ray goes ahead, what it shows."""
+            rows = slice(begin, min(begin + tile, pixels))
+            there, in_camera = rays_of_pixels(camera, rows.start, rows.stop, self.device)
+            found = self.render_rays(*self.rays_of(in_camera, pose), names, geometry) if len(in_camera) else {}
+            return rows, there.cpu().numpy(), in_camera[:, 2], found
 
-        for rows, found in self.cast_tiles(parts(), pose, names, geometry):
+        for rows, there, ahead, found in _of_tiles(self.device, seen, range(0, pixels, tile)):
+            valid[rows] = there
+            _put(forward[rows], there, ahead)
             for key, value in found.items():
                 if key not in images:
                     images[key] = np.full((pixels, *value.shape[1:]), 0.0 if key == "opacity" else np.nan, np.float32)
-                images[key][rows] = value
+                _put(images[key][rows], there, value)
             if progress is not None:
-                progress(len(rows))
+                progress(len(ahead))
         picture = functools.partial(picture_of, images, (camera.height, camera.width))
         depth = picture("depth", 1)[..., 0] * np.float32(self.region.radius)
         return Rendering(
@@ -434,3 +439,13 @@ class Field(nn.Module):
             if name not in self.sensors:
                 raise InputError(f"modality {name!r}: not in this field, expected one of {', '.join(self.sensors)}.")
         return names
+
+
+def _put(pixels: np.ndarray, there: np.ndarray, values: Tensor) -> None:
+    """The values of those pixels of a tile that are ``there``: mostly all, and then at once."""
+    pixels[... if there.all() else there] = values.cpu().numpy()
+
+
+def _of_tiles(device: torch.device, work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[T]:
+    """What ``work`` makes of each tile: on a CPU side by side, by a GPU one after the other."""
+    return (made for _, made in side_by_side(work, tiles)) if device.type == "cpu" else map(work, tiles)

@@ -8,7 +8,6 @@ Pixel coordinates u, v are column and row; the centre of the top-left pixel is (
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -204,13 +203,14 @@ _small_ray_map = functools.lru_cache(maxsize=64)(_ray_map)
 _large_ray_map = functools.lru_cache(maxsize=1)(_ray_map)
 
 
-def rays_by_parts(camera: Camera, pixels: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """``ray_map``, made anew and in parts, each of at most so many pixels: numbers (N,) of those that have a ray, row by row, and unit
-    directions (N, 3) float64."""
-    for begin in range(0, camera.width * camera.height, pixels):
-        index = np.arange(begin, min(begin + pixels, camera.width * camera.height))
-        directions, valid = unproject(np.stack([index % camera.width, index // camera.width], -1).astype(np.float64), camera)
-        yield index[valid], directions[valid]
+def rays_of_pixels(camera: Camera, begin: int, end: int, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+    """``ray_map`` of the pixels number ``begin`` to ``end - 1``, row by row, made anew on a device: which have a ray (P,) bool, and the
+    unit directions (N, 3) float64 of those N that do."""
+    index = torch.arange(begin, end, device=device)
+    pixels = torch.stack([index % camera.width, index // camera.width], -1).double()
+    intrinsics, coefficients, lens = _parameters(camera)
+    directions, valid = unproject_points(pixels, intrinsics.to(device), coefficients.to(device), lens)
+    return valid, directions[valid]
 
 
 def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray) -> np.ndarray:

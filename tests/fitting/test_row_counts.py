@@ -13,6 +13,8 @@ from mmsynth.field.design import Design
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.field import Field
 from mmsynth.field.storage import load_field
+from mmsynth.fitting.measurements import load_measurements
+from mmsynth.fitting.needs import assess
 from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -81,6 +83,19 @@ def test_a_short_fit_has_fewer_rows(scene: Scene) -> None:
     designs = {steps: Trainer(scene, recipe, steps, None, 0, "cpu").field.design for steps in (100, 2000, 8000)}
     assert [d.radiance_rows_log2 for d in designs.values()] == [12, 16, 17]
     assert [d.surface_rows_log2 for d in designs.values()] == [12, 15, 16]
+
+
+def test_a_long_fit_has_tables_beyond_what_caches_hold(scene: Scene) -> None:
+    """Ten times the rays for each row more; 5 seconds of a GPU and 10 minutes of two cores have none, the GPU's minute has them."""
+    measurements = load_measurements(scene)
+    rows = {}
+    for rays in (4.2e7, 5e7, 1.5e8, 2.5e8, 6e8, 1e12):
+        design = assess(scene, measurements, Recipe(), 0, rays).design
+        rows[rays] = design.surface_rows_log2, design.radiance_rows_log2
+    assert list(rows.values()) == [(16, 17), (16, 17), (17, 18), (18, 19), (19, 20), (19, 20)]
+    few = Recipe().with_changes({"surface.max_rows_log2": 14, "radiance.max_rows_log2": 18})
+    design = assess(scene, measurements, few, 0, 1e12).design
+    assert (design.surface_rows_log2, design.radiance_rows_log2) == (14, 18)
 
 
 @settings(max_examples=30, deadline=None)

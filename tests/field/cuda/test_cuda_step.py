@@ -1,6 +1,7 @@
 """Steps of a fit as its device takes them, from photosites to moved parameters."""
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -65,16 +66,14 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
 def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As ``mmsynth fit --device cuda`` does it, on a GPU that is not there: what is to be a graph waits for nothing."""
-    if device != "cpu":
-        pytest.skip("a fit on a GPU does it")
+    """As ``mmsynth fit --device cuda`` does it; on a GPU that is not there, too: what is to be a graph waits for nothing."""
     few_looks(monkeypatch, rays=8)
     monkeypatch.setattr(DeviceStep, "samples", 256)
     monkeypatch.setattr(DeviceStep, "first_rays", 8)
     scene = load_scene(write_scene(tmp_path, {"rgb": around(4), "nir": around(4)}))
     recipe = QUICK.with_changes({"radiance.exposure": "on", "radiance.light": "off", "poses.views": "on", **FEW})
     begin = lambda: Trainer(scene, recipe, steps=4, budget=None, seed=0, device="cuda")
-    with pretended_gpu():
+    with pretended_gpu() if device == "cpu" else nullcontext():
         whole = begin()
         while whole.progress < 1.0:
             whole.run_step()
@@ -89,9 +88,15 @@ def test_a_fit_decides_all_on_its_device_and_goes_on_from_its_checkpoint(
     state = whole.state
     assert state.decided is not None and state.light is not None and state.tables is not None and whole.refinement.steps > 1
     assert state.step == 4 and state.bad_steps == 0 and 0.0 < state.mean_loss < 10.0 and state.samples_total > state.rays_total
-    assert first["state"] == second["state"]
+    if device == "cpu":
+        assert first["state"] == second["state"]
     for name, value in first["field"].items():
-        assert torch.equal(value, second["field"][name]), name
+        other = second["field"][name]
+        if device == "cpu":
+            assert torch.equal(value, other), name
+        else:  # whose atomic additions have an order of their own in every run
+            error = (value.double() - other.double()).abs().flatten()
+            assert float(error.quantile(0.9)) <= 1e-3 * float(value.abs().max()), name
 
 
 def test_arrays_that_graphs_hold_stay_or_the_graphs_go(device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
