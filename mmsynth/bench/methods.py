@@ -84,22 +84,27 @@ def measured(families: Mapping[str, Sequence[Method]], repeats: int, progress: P
 
 
 def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
-    """``cpu_ns``: as ``ns``, of CPU time: on a machine that others use, too, it says more than time."""
-    times: list[list[float]] = [[] for _ in group]
-    work: list[list[float]] = [[] for _ in group]
-    judged = [method.judge(method.run()) for method in group]
-    for _ in range(repeats):
-        for method, taken, worked in zip(group, times, work, strict=True):
-            began, busy = time.perf_counter(), time.process_time()
-            method.run()
-            taken.append(time.perf_counter() - began)
-            worked.append(time.process_time() - busy)
+    """``cpu_ns``: as ``ns``, of CPU time: on a machine that others use, too, it says more than time. Without repeats the times are of
+    the run that is judged, and of all that a first run has to do."""
+
+    def timed(method: Method) -> tuple[Any, tuple[float, float]]:
+        began, busy = time.perf_counter(), time.process_time()
+        result = method.run()
+        return result, (time.perf_counter() - began, time.process_time() - busy)
+
+    judged, first = [], []
+    for method in group:
+        result, taken = timed(method)
+        judged.append(method.judge(result))
+        first.append(taken)
+    turns = [[timed(method)[1] for method in group] for _ in range(repeats)] or [first]
     return [
         {
             "problem": method.problem, "method": method.name, "unit": method.unit,
-            "ns": statistics.median(taken) / method.count * 1e9, "cpu_ns": statistics.median(worked) / method.count * 1e9, **found,
+            "ns": statistics.median(turn[i][0] for turn in turns) / method.count * 1e9,
+            "cpu_ns": statistics.median(turn[i][1] for turn in turns) / method.count * 1e9, **found,
         }
-        for method, taken, worked, found in zip(group, times, work, judged, strict=True)
+        for i, (method, found) in enumerate(zip(group, judged, strict=True))
     ]  # fmt: skip
 
 

@@ -7,15 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from few_looks import few_looks
 from test_cli import here, refused
 
 from mmsynth.workflows.runs import open_run
+
+pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run of the example, a prior of it, and a fit of rgb that predicts the rest."""
     folder = tmp_path_factory.mktemp("prior")
+    with pytest.MonkeyPatch.context() as patch:
+        few_looks(patch)
+        _make(folder)
+    return folder
+
+
+def _make(folder: Path) -> None:
     assert here(folder, "fit", "example", "--steps", "25", "--run", "all", "--json").returncode == 0
     made = here(folder, "prior", "all", "--out", "p.safetensors", "--json")
     assert json.loads(made.stdout) == {
@@ -25,7 +35,6 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     result = here(folder, "fit", "example", "--modalities", "rgb", "--prior", "p.safetensors", "--steps", "25", "--run", "few")
     assert result.returncode == 0 and "prior: on: nir, mono, pol, ms predicted from rgb, by 1 scene;" in result.stdout, result.stderr
-    return folder
 
 
 def test_a_field_that_predicts_is_read_as_it_was_written(work: Path) -> None:
