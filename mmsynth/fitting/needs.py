@@ -16,12 +16,11 @@ import numpy as np
 from mmsynth.field.design import Design
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements, draw
-from mmsynth.fitting.recipe import RadianceRecipe, Recipe, SurfaceRecipe
+from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.table_sizes import rows_log2
 from mmsynth.scene.scene import MaskMeaning, Scene
 from mmsynth.sensors.camera import Camera
 
-_BEYOND_CACHES = 10.0  # times as many rays for a row, where a table has more than caches hold
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
 _OUTERMOST = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
 _COARSE = 128  # cells across the grid that a surface may have however few the measurements: small pictures show large things
@@ -264,16 +263,9 @@ def _table_rows(f: _Facts) -> tuple[int, int]:
     surface, radiance = f.recipe.surface, f.recipe.radiance
     if f.recipe.schedule.tables_at == 0:
         return surface.max_rows_log2, radiance.max_rows_log2
-    return _rows_for(f.rays_to_come, surface), _rows_for(f.rays_to_come, radiance)
-
-
-def _rows_for(rays: float, grid: SurfaceRecipe | RadianceRecipe) -> int:
-    """log2 of the rows of a level's table for the rays of a fit: a row that few meet is noise, and costs as much as any other.
-
-    Measured: Lego at 800 x 800, 45 s of an H100: 7.7e8 rays and 2^16 and 2^17 rows 30.66 dB, 6.5e8 rays and 2^19 and 2^20 rows 31.74 dB.
-    """
-    within = rows_log2(rays / grid.rays_per_row, min(grid.cheap_rows_log2, grid.max_rows_log2))
-    return max(within, rows_log2(rays / (_BEYOND_CACHES * grid.rays_per_row), grid.max_rows_log2))
+    # a row that few rays meet is noise, and costs as much as any other
+    rows = lambda grid: rows_log2(f.rays_to_come / grid.rays_per_row, grid.max_rows_log2)
+    return rows(surface), rows(radiance)
 
 
 def _footprint(measurements: Measurements) -> float:

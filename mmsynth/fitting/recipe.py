@@ -24,16 +24,12 @@ def _key(default: Any, meaning: str, **limits: Any) -> Any:
     return Field(default, description=meaning, **limits)
 
 
-_CHEAP_ROWS = "log2 of the most rows that a CPU's caches hold; a table has more where the fit has ten times the rays_per_row for each."
-
-
 class SurfaceRecipe(_Section):
     """The surface: a hash grid and a small network that give the signed distance."""
 
     background: Switch = _key("auto", "Model what is outside the region of interest, in a contracted space twice as wide.")
     levels: int = _key(5, "Levels of the hash grid.", ge=1, le=16)
     max_rows_log2: int = _key(19, "log2 of the most rows that a level's table may have.", ge=8, le=22)
-    cheap_rows_log2: int = _key(16, _CHEAP_ROWS, ge=8, le=22)
     cells_per_pixel: float = _key(1.0, "Cells of the finest level in a pixel's footprint [1/footprint].", gt=0)
     measurements_per_cell: float = _key(
         10.0, "Rays that must see a cell of the finest level, on the average [rays]; where fewer do: coarser and softer.", gt=0
@@ -61,7 +57,6 @@ class RadianceRecipe(_Section):
     )
     levels: int = _key(6, "Levels of the hash grid.", ge=1, le=16)
     max_rows_log2: int = _key(20, "log2 of the most rows that a level's table may have.", ge=8, le=22)
-    cheap_rows_log2: int = _key(17, _CHEAP_ROWS, ge=8, le=22)
     cells_per_pixel: float = _key(2.0, "Cells of the finest level in a pixel's footprint [1/footprint].", gt=0)
     cells_per_row: float = _key(1.5, "Cells of the finest level at the surface that share a row of its table [cells].", gt=0)
     rays_per_row: float = _key(50.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)

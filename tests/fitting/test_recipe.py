@@ -20,7 +20,7 @@ def test_the_page_of_keys_is_the_models() -> None:
 @pytest.mark.parametrize("section", SECTIONS)
 def test_every_key_has_a_meaning_and_every_number_a_unit(section: str) -> None:
     model: type[BaseModel] = SECTIONS[section]
-    counts = ("levels", "max_rows_log2", "cheap_rows_log2", "hidden_width", "view_dependence")  # plain numbers, which have none
+    counts = ("levels", "max_rows_log2", "hidden_width", "view_dependence")  # plain numbers, which have none
     for key, field in model.model_fields.items():
         assert field.description and field.description.rstrip().endswith("."), key
         if field.annotation in (int, float, float | None) and key not in counts:

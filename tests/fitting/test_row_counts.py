@@ -85,17 +85,17 @@ def test_a_short_fit_has_fewer_rows(scene: Scene) -> None:
     assert [d.surface_rows_log2 for d in designs.values()] == [12, 15, 16]
 
 
-def test_a_long_fit_has_tables_beyond_what_caches_hold(scene: Scene) -> None:
-    """Ten times the rays for each row more; 5 seconds of a GPU and 10 minutes of two cores have none, the GPU's minute has them."""
+def test_rows_follow_the_rays_of_a_fit(scene: Scene) -> None:
+    """A minute of two cores, two, five and ten; hours."""
     measurements = load_measurements(scene)
-    rows = {}
-    for rays in (4.2e7, 5e7, 1.5e8, 2.5e8, 6e8, 1e12):
-        design = assess(scene, measurements, Recipe(), 0, rays).design
-        rows[rays] = design.surface_rows_log2, design.radiance_rows_log2
-    assert list(rows.values()) == [(16, 17), (16, 17), (17, 18), (18, 19), (19, 20), (19, 20)]
-    few = Recipe().with_changes({"surface.max_rows_log2": 14, "radiance.max_rows_log2": 18})
-    design = assess(scene, measurements, few, 0, 1e12).design
-    assert (design.surface_rows_log2, design.radiance_rows_log2) == (14, 18)
+
+    def rows(rays: float, **changes: int) -> tuple[Any, Any]:
+        recipe = Recipe().with_changes({f"{grid}.max_rows_log2": most for grid, most in changes.items()})
+        design = assess(scene, measurements, recipe, 0, rays).design
+        return design.surface_rows_log2, design.radiance_rows_log2
+
+    assert [rows(rays) for rays in (4.2e6, 8.4e6, 2.1e7, 4.2e7, 1e12)] == [(15, 16), (16, 17), (18, 19), (19, 20), (19, 20)]
+    assert rows(1e12, surface=14, radiance=18) == (14, 18)
 
 
 @settings(max_examples=30, deadline=None)
