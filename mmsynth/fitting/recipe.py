@@ -35,7 +35,7 @@ class SurfaceRecipe(_Section):
         10.0, "Rays that must see a cell of the finest level, on the average [rays]; where fewer do: coarser and softer.", gt=0
     )
     cells_per_row: float = _key(1.5, "Cells of the finest level at the surface that share a row of its table [cells].", gt=0)
-    rays_per_row: float = _key(100.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)
+    rays_per_row: float = _key(150.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)
     hidden_width: int = _key(32, "Width of the network's hidden layer.", ge=4, le=256, multiple_of=4)
     initial_radius: float | None = _key(
         None, "Radius of the sphere that a fit starts from [region radius]; left out: chosen by the scene.", gt=0, lt=1
@@ -59,7 +59,7 @@ class RadianceRecipe(_Section):
     max_rows_log2: int = _key(20, "log2 of the most rows that a level's table may have.", ge=8, le=22)
     cells_per_pixel: float = _key(2.0, "Cells of the finest level in a pixel's footprint [1/footprint].", gt=0)
     cells_per_row: float = _key(1.5, "Cells of the finest level at the surface that share a row of its table [cells].", gt=0)
-    rays_per_row: float = _key(50.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)
+    rays_per_row: float = _key(75.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)
     hidden_width: int = _key(64, "Width of the shader's hidden layer.", ge=4, le=256)
     view_dependence: Literal["auto", 0, 1, 2, 3] = _key(
         "auto", "Degree of the spherical harmonics of radiance over directions; auto: views judge that are held out until then."
@@ -126,7 +126,7 @@ class ScheduleRecipe(_Section):
         10.0, "Sharpness of the surface at the start [1/region radius]; its soft part is 3.5 / sharpness thick.", gt=0
     )
     sharpness_per_footprint: float = _key(4.0, "Sharpness of the surface at the end [1/pixel footprint].", gt=0)
-    sharpness_until: float = _key(0.6, "Progress at which the sharpness has reached its end [progress].", gt=0, le=1)
+    sharpness_until: float = _key(0.4, "Progress at which the sharpness has reached its end [progress].", gt=0, le=1)
     levels_until: float = _key(0.25, "Progress at which all levels of the grids are active [progress].", gt=0, le=1)
     tables_at: float = _key(
         0.05,
