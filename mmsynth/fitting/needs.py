@@ -40,6 +40,7 @@ class Needs:
 
     Attributes:
         footprint: the finest detail to expect at the region's centre, in radii. sharpness_end: of the surface [1/region radius].
+        sharpness_until: progress at which it is as sharp.
         black_background: whether black pixels say that nothing is there.
         sparse: modalities that learn their colours from the geometry and appearance of the others: with so few pixels that they would
             spoil what others know better, or without the masks of the object that others have.
@@ -50,6 +51,7 @@ class Needs:
     design: Design
     footprint: float
     sharpness_end: float
+    sharpness_until: float
     black_background: bool
     sparse: tuple[str, ...]
     share: dict[str, float]
@@ -153,6 +155,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
         design=design,
         footprint=footprint,
         sharpness_end=max(sharpness, 2 * recipe.schedule.sharpness_start),
+        sharpness_until=recipe.schedule.sharpness_until * _sooner(rays_to_come),
         black_background=not background.value and facts.outside >= _PAST,
         sparse=tuple(n for n, s in share.value.items() if s < 1.0 or n in facts.unmasked),
         share=share.value,
@@ -266,6 +269,14 @@ def _table_rows(f: _Facts) -> tuple[int, int]:
     # a row that few rays meet is noise, and costs as much as any other
     rows = lambda grid: rows_log2(f.rays_to_come / grid.rays_per_row, grid.max_rows_log2)
     return rows(surface), rows(radiance)
+
+
+def _sooner(rays: float) -> float:
+    """Share of the time, relative to that of a fit of a minute, in which the surface gets sharp: what it takes to find a shape are steps.
+
+    Measured at a share of 2/3: 300 and 1,200 steps lose 0.5 and 0.15 dB, 5,000 nothing, 12,000 gain 0.4 dB.
+    """
+    return min(1.0, max(2 / 3, (rays / (60.0 * _RAYS_PER_SECOND)) ** -0.25))
 
 
 def _footprint(measurements: Measurements) -> float:

@@ -126,7 +126,13 @@ class ScheduleRecipe(_Section):
         10.0, "Sharpness of the surface at the start [1/region radius]; its soft part is 3.5 / sharpness thick.", gt=0
     )
     sharpness_per_footprint: float = _key(4.0, "Sharpness of the surface at the end [1/pixel footprint].", gt=0)
-    sharpness_until: float = _key(0.4, "Progress at which the sharpness has reached its end [progress].", gt=0, le=1)
+    sharpness_until: float = _key(
+        0.6,
+        "Progress at which the sharpness has reached its end [progress]; sooner in fits of more rays than 4.2e6, from 2.1e7 on at two "
+        "thirds of it.",
+        gt=0,
+        le=1,
+    )
     levels_until: float = _key(0.25, "Progress at which all levels of the grids are active [progress].", gt=0, le=1)
     tables_at: float = _key(
         0.05,

@@ -12,7 +12,7 @@ from mmsynth.fitting.recipe import Recipe
 
 def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
     """Sharpness grows exponentially to its end, the step follows it, and grid levels open one by one."""
-    grown = min(1.0, progress / recipe.schedule.sharpness_until)
+    grown = min(1.0, progress / needs.sharpness_until)
     sharpness = recipe.schedule.sharpness_start * (needs.sharpness_end / recipe.schedule.sharpness_start) ** grown
     opened = min(1.0, progress / recipe.schedule.levels_until)
 

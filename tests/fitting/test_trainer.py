@@ -31,6 +31,7 @@ from mmsynth.fitting.ahead import DrawnStep, drawn_step
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.device import pick_device
 from mmsynth.fitting.measurements import draw, load_measurements
+from mmsynth.fitting.needs import assess
 from mmsynth.fitting.progress import FitProgress
 from mmsynth.fitting.recipe import Recipe, load_recipe
 from mmsynth.fitting.run import fit
@@ -646,6 +647,16 @@ def test_detail_follows_the_pixels_and_what_the_fit_can_see_of_them(scene: Scene
     assert long.footprint == pytest.approx(distance / np.median([c.fx for c in cameras]), rel=0.02)
     assert short.footprint > 2 * long.footprint
     assert short.design.surface_finest <= long.design.surface_finest and short.sharpness_end < long.sharpness_end
+
+
+def test_a_long_fit_is_sharp_sooner(scene: Scene) -> None:
+    """In steps it is later: what two minutes take is more than half of what one does."""
+    measurements = load_measurements(scene)
+    until = [assess(scene, measurements, Recipe(), 0, rays).sharpness_until for rays in (1.0, 4.2e6, 8.4e6, 2.2e7, 1e12)]
+    assert until == pytest.approx([0.6, 0.6, 0.6 * 2**-0.25, 0.4, 0.4], rel=1e-6)
+    half = assess(scene, measurements, Recipe().with_changes({"schedule.sharpness_until": 0.3}), 0, 1e12)
+    assert half.sharpness_until == pytest.approx(0.2) and sampling_at(0.2, Recipe(), half).sharpness == pytest.approx(half.sharpness_end)
+    assert sampling_at(0.19, Recipe(), half).sharpness < 0.9 * half.sharpness_end
 
 
 def test_a_grid_in_which_nothing_is_left_opens_again_and_it_is_counted(scene: Scene) -> None:
