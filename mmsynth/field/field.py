@@ -37,7 +37,6 @@ TILE, _ON_GPU = 8192, 1 << 17  # rays at a time: what they need stays in the cac
 MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
 
-
 P = TypeVar("P")
 T = TypeVar("T")
 

@@ -1,5 +1,6 @@
 """Cameras against OpenCV and kornia, on the whole range of lenses that are promised."""
 
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -13,7 +14,18 @@ from hypothesis import strategies as st
 from mmsynth.errors import InputError
 from mmsynth.sensors import camera as cameras
 from mmsynth.sensors import lenses
-from mmsynth.sensors.camera import Camera, Lens, every_nth, project, project_points, ray_map, round_trip_error, unproject, unproject_points
+from mmsynth.sensors.camera import (
+    Camera,
+    Lens,
+    every_nth,
+    project,
+    project_points,
+    ray_map,
+    rays_of_pixels,
+    round_trip_error,
+    unproject,
+    unproject_points,
+)
 
 RIG = Camera(160, 120, 171.8, 171.5, 80.1, 58.9, (-0.118, 0.092, 0.0006, -0.0009, 0.01, 0.0))
 RATIONAL = Camera(160, 120, 120.0, 121.0, 80.1, 58.9, (0.2, -0.1, 0.0006, -0.0009, 0.01, 0.4, -0.05, 0.02))
@@ -254,6 +266,17 @@ def test_rays_of_a_large_camera_are_those_of_its_pixels(monkeypatch: pytest.Monk
     assert ray_map(camera)[0] is directions and not directions.flags.writeable
     ray_map(other)
     assert ray_map(camera)[0] is not directions
+
+
+def test_rays_made_by_parts_are_those_of_the_map() -> None:
+    """Of a lens that has none in the corners, too."""
+    for camera in (RIG, FISHEYE, Camera(20, 11, 12.0, 12.0, 9.4, 5.0, (-0.5, 0.1, 0.0, 0.0))):
+        directions, valid = ray_map(camera)
+        ends = [*range(0, valid.size, 1 + valid.size // 7), valid.size]
+        parts = [rays_of_pixels(camera, begin, end) for begin, end in pairwise(ends)]
+        np.testing.assert_array_equal(torch.cat([there for there, _ in parts]), valid.ravel())
+        np.testing.assert_allclose(torch.cat([rays for _, rays in parts]), directions[valid], atol=1e-14)
+    assert not valid.all()
 
 
 def test_every_nth_photosite_has_the_ray_that_it_had() -> None:
