@@ -67,7 +67,12 @@ def chosen_families(families: Sequence[Family], bench: str, only: Sequence[str] 
 
 
 def measured(families: Mapping[str, Sequence[Method]], repeats: int, progress: Progress | None, threads: int = 1) -> list[dict[str, Any]]:
-    """One row per method; ``families``: their methods, by name."""
+    """One row per method.
+
+    Args:
+        families: their methods, by name. repeats: how often each is timed, after a run that is judged; 0: that run is timed, with all
+            that a first one has to do.
+    """
     problems = list(dict.fromkeys((family, method.problem) for family, methods in families.items() for method in methods))
     counter = Counter(progress, len(problems))
     rows, before = [], cv2.getNumThreads()
@@ -84,8 +89,7 @@ def measured(families: Mapping[str, Sequence[Method]], repeats: int, progress: P
 
 
 def _measured(group: Sequence[Method], repeats: int) -> list[dict[str, Any]]:
-    """``cpu_ns``: as ``ns``, of CPU time: on a machine that others use, too, it says more than time. Without repeats the times are of
-    the run that is judged, and of all that a first run has to do."""
+    """``cpu_ns``: as ``ns``, of CPU time: on a machine that others use, too, it says more than time."""
 
     def timed(method: Method) -> tuple[Any, tuple[float, float]]:
         began, busy = time.perf_counter(), time.process_time()

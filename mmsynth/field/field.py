@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.picture import Rendering, picture_of
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
-from mmsynth.field.tiles import side_by_side
+from mmsynth.field.tiles import tile_by_tile
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor
@@ -36,9 +36,6 @@ from mmsynth.sensors.polarization import reference_axes, stokes_to_intensities
 TILE, _ON_GPU = 8192, 1 << 17  # rays at a time: what they need stays in the caches; of a GPU fewer leave most idle
 MIRROR_CELLS = 2.0  # over which normals of mirrors are differences: one has the grid's noise in it, three blur the edges
 _WITHIN = 1.0 + 1e-4  # of the region's radius, with room for rounding
-
-P = TypeVar("P")
-T = TypeVar("T")
 
 
 class Field(nn.Module):
@@ -362,8 +359,9 @@ class Field(nn.Module):
         """
         size = self.tile
         tiles = ((index[i : i + size], rays[i : i + size]) for index, rays in parts for i in range(0, len(index), size))
-        cast = lambda tile: (tile[0], self.cast(tile[1], camera_to_world, modalities, geometry, light))
-        return _of_tiles(self.device, cast, tiles)
+        cast = lambda tile: self.cast(tile[1], camera_to_world, modalities, geometry, light)
+        for (index, _), seen in tile_by_tile(self.device, cast, tiles):
+            yield index, seen
 
     def rays_of(self, directions: np.ndarray | Tensor, camera_to_world: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
         """Rays of one camera, (R, 3) in its axes → origins, directions and camera_x of ``render_rays``, (R, 3) each."""
@@ -394,18 +392,18 @@ class Field(nn.Module):
         pose = np.asarray(camera_to_world, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError(f"pose: expected a finite 4x4 camera_to_world matrix, found shape {pose.shape} or NaN in it.")
-        pixels, tile = camera.width * camera.height, self.tile
+        pixels = camera.width * camera.height
         images: dict[str, np.ndarray] = {}
         valid, forward = np.zeros(pixels, bool), np.zeros(pixels, np.float32)
 
-        def seen(begin: int) -> tuple[slice, np.ndarray, Tensor, dict[str, Tensor]]:
+        def seen(begin: int) -> tuple[np.ndarray, Tensor, dict[str, Tensor]]:
             """Of the pixels of a tile: which have a ray, how far each ray goes ahead, what it shows."""
-            rows = slice(begin, min(begin + tile, pixels))
-            there, in_camera = rays_of_pixels(camera, rows.start, rows.stop, self.device)
+            there, in_camera = rays_of_pixels(camera, begin, min(begin + self.tile, pixels), self.device)
             found = self.render_rays(*self.rays_of(in_camera, pose), names, geometry) if len(in_camera) else {}
-            return rows, there.cpu().numpy(), in_camera[:, 2], found
+            return there.cpu().numpy(), in_camera[:, 2], found
 
-        for rows, there, ahead, found in _of_tiles(self.device, seen, range(0, pixels, tile)):
+        for begin, (there, ahead, found) in tile_by_tile(self.device, seen, range(0, pixels, self.tile)):
+            rows = slice(begin, begin + len(there))
             valid[rows] = there
             _put(forward[rows], there, ahead)
             for key, value in found.items():
@@ -443,8 +441,3 @@ class Field(nn.Module):
 def _put(pixels: np.ndarray, there: np.ndarray, values: Tensor) -> None:
     """The values of those pixels of a tile that are ``there``: mostly all, and then at once."""
     pixels[... if there.all() else there] = values.cpu().numpy()
-
-
-def _of_tiles(device: torch.device, work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[T]:
-    """What ``work`` makes of each tile: on a CPU side by side, by a GPU one after the other."""
-    return (made for _, made in side_by_side(work, tiles)) if device.type == "cpu" else map(work, tiles)

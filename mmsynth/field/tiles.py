@@ -55,6 +55,11 @@ def side_by_side(work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[tuple[P
             result.cancel()
 
 
+def tile_by_tile(device: torch.device, work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[tuple[P, T]]:
+    """``side_by_side`` on a CPU; a GPU, which one tile fills, takes one after the other."""
+    return side_by_side(work, tiles) if device.type == "cpu" else ((tile, work(tile)) for tile in tiles)
+
+
 def _threads() -> int:
     """Threads that tiles may have, those that numba is to use."""
     count = numba.get_num_threads()  # starts them, so that their layer is known
