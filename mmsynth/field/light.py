@@ -110,6 +110,7 @@ def stokes_around(around: Surroundings, x: Tensor, y: Tensor) -> Tensor:
 
 
 _DIRECTIONS = 1500  # about 5 degrees apart
+_VOTERS = 256  # rays at a time
 _CONCENTRATION = 40.0  # of a ray's vote: 9 degrees wide
 _APART = math.cos(math.radians(30.0))
 _LEAST_VOTE = 0.3  # of the best direction's
@@ -132,7 +133,7 @@ def find_lamps(reflected: Tensor, light: Tensor, missing: Tensor | None = None, 
     turn, radius = math.pi * (1.0 + math.sqrt(5.0)) * i, torch.sqrt(1.0 - z * z)
     sphere = torch.stack([radius * torch.cos(turn), radius * torch.sin(turn), z], -1)  # Fibonacci's
     bright, rays = z.new_zeros(2, _DIRECTIONS), torch.zeros_like(z)
-    for part, weight in zip(reflected.split(2048), torch.stack([light, missing], 1).split(2048), strict=True):
+    for part, weight in zip(reflected.split(_VOTERS), torch.stack([light, missing], 1).split(_VOTERS), strict=True):
         votes = torch.exp(_CONCENTRATION * (part @ sphere.T - 1.0))
         bright, rays = bright + weight.T @ votes, rays + votes.sum(0)
     whole, score = bright / (rays + _PRIOR * rays.max())

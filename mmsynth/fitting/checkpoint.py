@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,17 @@ _NAME = "state.pt"
 
 def write_checkpoint(run: Path, state: dict[str, Any]) -> None:
     """Replace the run's checkpoint. ``state`` holds tensors, numbers, strings and containers of them."""
-    content = io.BytesIO()  # torch's own file writer answers a full disk with an internal error
-    torch.save(state, content)
-    write_atomic(run / CHECKPOINT_FOLDER / _NAME, lambda path: path.write_bytes(content.getbuffer()))
+    write_atomic(run / CHECKPOINT_FOLDER / _NAME, lambda path: _save(state, path))
+
+
+def _save(state: dict[str, Any], path: Path) -> None:
+    try:
+        with open(path, "wb") as stream:  # not as bytes first: they would be kept twice
+            torch.save(state, stream)
+    except RuntimeError as error:  # of torch's own, where the stream cannot be written
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
 
 
 def read_checkpoint(run: Path) -> dict[str, Any] | None:

@@ -21,8 +21,8 @@ from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian, Saved
 from mmsynth.fitting.recipe import PosesRecipe
 from mmsynth.scene.scene import Scene
 
-_AT_ONCE = 2048  # rays of a batch: all that it goes through is kept for the way back
-_DECIDE = 16  # batches at least, by which it is decided
+_AT_ONCE = 1024  # rays of a batch: all that it goes through is kept for the way back
+_DECIDE = 32  # batches at least, by which it is decided
 _PER_STEP, _PER_VIEW = 4096, 64  # rays of a step at least
 _PER_FIT = 400_000  # rays from the beginning to the end of a fit, where each step moves cameras
 _PRIOR = 3.0  # footprints that a camera may be off, a standard deviation

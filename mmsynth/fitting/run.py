@@ -148,7 +148,7 @@ def _learn(
             news = trainer.report()
             log.append(json.dumps({"step": news.step, "elapsed": round(news.elapsed, 3), "loss": news.loss, "psnr": news.psnr}))
             last_logged = now
-        if now - last_saved > checkpoint_every:
+        if now - last_saved > checkpoint_every and trainer.progress < 1.0:
             _save(run, trainer, log)
             last_saved = time.perf_counter()
     _save(run, trainer, log)

@@ -173,6 +173,16 @@ def test_stores_are_used_again_and_let_go_when_nobody_asks(monkeypatch: pytest.M
     assert [arrays.block is block for _, arrays, _ in pool] == [True]
 
 
+def test_larger_stores_take_the_place_of_smaller_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Need that swings about a power of two would keep both; where they differ by more, calls in turns keep theirs."""
+    monkeypatch.setattr(stores, "_pool", pool := [])
+    for slots in (8, 100, 9):
+        stores.tap_store(slots, 8, 2)
+    assert sorted(len(arrays.block) for _, arrays, _ in pool) == [16, 128]
+    between = stores.tap_store(8, 8, 2).arrays.block
+    assert len(between) == 16 and between is stores.tap_store(16, 8, 2).arrays.block
+
+
 def test_hidden_units_come_in_fours() -> None:
     """The kernels take four at a time; they would read past the end of a fifth."""
     with pytest.raises(ValueError, match="multiple of 4"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import shutil
 import signal
 from collections.abc import Callable
@@ -99,21 +100,32 @@ def test_out_of_memory_in_a_step(
     row(f"no memory in a step ({request.node.callspec.id})", "a traceback", "one sentence, exit code 3; resumed: the same field")
 
 
-def test_a_disk_that_fills_up(row: Row, scene: Scene, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("how", ["when it is flushed", "in the middle"])
+def test_a_disk_that_fills_up(row: Row, scene: Scene, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     """While a checkpoint is written; the one before it is still there, whole."""
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    def fill() -> None:
+        if how == "in the middle":  # no file may be larger
+            resource.setrlimit(resource.RLIMIT_FSIZE, (sizes[0] // 2, sizes[1]))
+        else:
+            now.setattr(os, "fsync", full)
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    sizes = (whole / "checkpoint" / "state.pt").stat().st_size, before[1]
+    reason = os.strerror(errno.EFBIG if how == "in the middle" else errno.ENOSPC)
     with monkeypatch.context() as now:
-        with pytest.raises(InputError, match=r"could not be written \(No space left on device\)\.$"):
-            fit(
-                scene, tmp_path, recipe=QUICK, steps=STEPS, checkpoint_every=0.0, on_step=at_step(4, lambda: now.setattr(os, "fsync", full))
-            )
+        try:
+            with pytest.raises(InputError, match=rf"could not be written \({reason}\)\.$"):
+                fit(scene, tmp_path, recipe=QUICK, steps=STEPS, checkpoint_every=0.0, on_step=at_step(4, fill))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
     saved = read_checkpoint(tmp_path)
     assert saved is not None and saved["state"]["step"] == 3 and not list(tmp_path.rglob(".*"))
     assert same_after_resuming(scene, tmp_path, whole)
-    row("a disk that fills up while a checkpoint is written", "half a checkpoint", "that of before; resumed: the same field")
+    row(f"a disk that fills up while a checkpoint is written, {how}", "half a checkpoint", "that of before; resumed: the same field")
 
 
 def test_a_run_folder_that_goes_away(row: Row, scene: Scene, whole: Path, tmp_path: Path) -> None:

@@ -209,7 +209,7 @@ class _Compare(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         chunks = -(-len(rays.behind) // shading.CHUNK)
         tensors = ShaderWeights(*weights)
-        arrays = (store := shading_store(max(chunks, get_num_threads()), tensors)).arrays
+        arrays = (store := shading_store(max(chunks, get_num_threads()) if learn else get_num_threads(), tensors)).arrays
         loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
         gradients = [torch.empty(x.shape) for x in (features, share, gain, mirrored)]
         shading.compare(

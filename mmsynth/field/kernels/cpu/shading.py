@@ -267,18 +267,19 @@ def compare_rays(  # type: ignore[no-untyped-def]
 def compare(  # type: ignore[no-untyped-def]
     rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, loss, squared, g_features, g_share, g_gain, g_mirrored
 ):
-    """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` and ``mirrored`` may be empty; the loss and the
-    gradients of weights are per chunk.
+    """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` and ``mirrored`` may be empty; the loss and, where
+    ``learn``, the gradients of weights are per chunk.
 
-    store: ``ShadingStore``, whose scratch has a slot per thread.
+    store: ``ShadingStore``, whose scratch has a slot per thread, and its gradients where there are none.
     """
     total = len(rays.behind)
     for task in prange((total + CHUNK - 1) // CHUNK):
         chunk, slot = np.int64(task), np.int64(get_thread_id())
         begin = chunk * CHUNK
-        clear_gradients(store, chunk)
+        of_weights = chunk if learn else slot
+        clear_gradients(store, of_weights)
         loss[chunk] = compare_rays(
-            begin, min(CHUNK, total - begin), np.int64(0), slot, chunk, rays, measured, gain, mirrored, layers, heads, heads_bias,
+            begin, min(CHUNK, total - begin), np.int64(0), slot, of_weights, rays, measured, gain, mirrored, layers, heads, heads_bias,
             learn, store, squared, g_features, g_share, g_gain, g_mirrored,
         )  # fmt: skip
 

@@ -99,11 +99,14 @@ class Store(Generic[S]):
         slots = 1 << max(slots - 1, 3).bit_length()
         with _changing:
             _pool[:] = [entry for entry in _pool if now - entry[2] <= _IDLE]
-            for index, (key, arrays, _) in enumerate(_pool):
+            for index in reversed(range(len(_pool))):  # what was used last is used again: others grow idle
+                key, arrays, _ = _pool[index]
                 if key == self.key and slots <= len(arrays[0]) <= _SPARE * slots:
                     self.arrays = _pool.pop(index)[1]
                     break
             else:
+                # smaller ones that the new one stands in for are let go before it is made
+                _pool[:] = [e for e in _pool if not (e[0] == self.key and len(e[1][0]) < slots <= _SPARE * len(e[1][0]))]
                 self.arrays = kind(**{name: np.empty((slots, *shape), dtype) for name, (dtype, shape) in sizes})
         self.now = now
 
