@@ -21,7 +21,7 @@ def test_a_product_is_added(rows: int, inner: int, columns: int) -> None:
     a, b, out = _matrices(rows, inner, columns)
     expected = out + a.astype(np.float64) @ b
     matrices.add_product(a, b, out, rows, inner, columns)
-    assert np.abs(out - expected).max() < 1e-6 * np.sqrt(inner) * 10
+    assert np.abs(out - expected).max() < 1e-5 * np.sqrt(inner)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 from mmsynth.field import kernels
 from mmsynth.field.kernels import Measured, ShadedRays, cpu, reference
 from mmsynth.field.kernels.cpu import shading as cpu_shading
+from mmsynth.field.kernels.cpu import stores
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
@@ -242,6 +243,16 @@ def test_a_loss_is_the_same_without_a_gradient() -> None:
     for loss, squared in (first, second):
         assert not loss.requires_grad
         assert torch.equal(loss, expected["loss"]) and torch.equal(squared, expected["squared"])
+
+
+def test_no_room_is_made_for_gradients_that_nobody_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deciding about lamps compares 20,480 rays, 320 chunks, each with gradients of all weights."""
+    slots, store, case = [], stores.Store, _case(600)
+    monkeypatch.setattr(stores, "Store", lambda n, kind, sizes: slots.append(n) or store(n, kind, sizes))
+    with torch.no_grad():
+        _compare(case)
+    _compare(case)
+    assert slots == [numba.get_num_threads(), -(-len(case.behind) // cpu_shading.CHUNK)]
 
 
 def test_losses_do_not_share_what_they_keep() -> None:

@@ -91,6 +91,15 @@ def _off(layout: Layout, motions: Motions, true: np.ndarray) -> float:
     return float(np.sqrt(np.square((now - true) @ before).sum(1).mean()))
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-160, 1e-8, 1e-4, 1.0, np.pi, 6.0, 100.0])
+def test_rotations_are_scipys(angle: float) -> None:
+    motion = np.random.default_rng(0).normal(size=(50, 6))
+    motion[:, :3] *= angle / np.linalg.norm(motion[:, :3], axis=1, keepdims=True)
+    matrix = poses.motion_to_matrix(motion)
+    assert np.abs(matrix[:, :3, :3] - Rotation.from_rotvec(motion[:, :3]).as_matrix()).max() < 1e-15 * max(10.0, 10.0 * angle)
+    assert np.array_equal(matrix[:, :3, 3], motion[:, 3:]) and (matrix[:, 3] == [0, 0, 0, 1]).all()
+
+
 @given(arrays(float, (5, 6), elements=st.floats(-1, 1)))
 def test_motions_and_matrices_are_each_others_inverse(motion: np.ndarray) -> None:
     assert poses.matrix_to_motion(poses.motion_to_matrix(motion)) == pytest.approx(motion, abs=1e-12)
