@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from mmsynth.bench.machine import usable_cores
 from mmsynth.field.kernels import cpu
+from mmsynth.threads import usable_cores
 
 _PACKAGES = (
     "mmsynth",

@@ -15,16 +15,12 @@ import numpy as np
 import torch
 
 from mmsynth.errors import InputError
+from mmsynth.threads import usable_cores
 from mmsynth.version import __version__
 
 # instruction sets that decide the speed of the kernels
 _FLAGS = ("sse4_2", "avx", "avx2", "fma", "avx512f", "avx512bw", "avx512vl", "avx512_bf16", "avx512_vnni", "amx_tile", "neon", "sve")
 _REPEATS = 5
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def identify() -> dict[str, Any]:

@@ -5,7 +5,6 @@ Boards and frames that do not fit are left out and named with the reason; what c
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from mmsynth.scene.layouts.calibration import Rig, RigSensor
 from mmsynth.scene.motion import inverse
 from mmsynth.scene.scene import canonical_modality
 from mmsynth.sensors.camera import COEFFICIENTS, Camera
+from mmsynth.threads import usable_cores
 
 LEAST_BOARDS = 4
 _BAD_BOARD, _BAD_SCALE = 3.0, 5.0  # medians of the boards' rms, and standard deviations, beyond which a board is left out
@@ -149,7 +149,7 @@ def calibrate(
         raise InputError(f"{folder}: no sensor '{reference}' to be the reference, expected one of {', '.join(names)}.")
     order = [chosen, *(name for name in names if name != chosen)]
     total, done = sum(len(sensor.files) for sensor in sensors.values()), 0
-    count = workers or len(os.sched_getaffinity(0))
+    count = workers or usable_cores()
     for name in order:
         sensors[name] = find_in_frames(sensors[name], boards, count, progress, done, total)
         done += len(sensors[name].files)
