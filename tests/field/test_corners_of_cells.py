@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from from_python import from_python
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import reference
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, HASH_PRIMES
+from mmsynth.field.kernels.cpu import blocks, corners
 from mmsynth.field.kernels.cpu.arrays import as_arrays
-from mmsynth.field.kernels.cpu.blocks import encode_block, scatter_block
-from mmsynth.field.kernels.cpu.corners import AT_ONCE, find_corners, same_cell
+from mmsynth.field.kernels.cpu.corners import AT_ONCE, same_cell
 
+encode_block, scatter_block, find_corners = map(from_python, (blocks.encode_block, blocks.scatter_block, corners.find_corners))
 CORNERS = np.array([[c >> 2 & 1, c >> 1 & 1, c & 1] for c in range(8)])
 
 

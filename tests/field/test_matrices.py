@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from from_python import from_python
 from numba import njit
 
 from mmsynth.field.kernels.cpu import matrices
+
+add_product = from_python(matrices.add_product)
 
 
 def _matrices(rows: int, inner: int, columns: int) -> tuple[np.ndarray, ...]:
@@ -20,7 +23,7 @@ def _matrices(rows: int, inner: int, columns: int) -> tuple[np.ndarray, ...]:
 def test_a_product_is_added(rows: int, inner: int, columns: int) -> None:
     a, b, out = _matrices(rows, inner, columns)
     expected = out + a.astype(np.float64) @ b
-    matrices.add_product(a, b, out, rows, inner, columns)
+    add_product(a, b, out, rows, inner, columns)
     assert np.abs(out - expected).max() < 1e-5 * np.sqrt(inner)
 
 
@@ -37,7 +40,7 @@ def test_large_tiles_add_the_same_bits(tile: Any, rows: int, columns: int) -> No
 
     a, b, out = _matrices(8, 33, 32)
     by_tiles, before = out.copy(), out.copy()
-    matrices.add_product(a, b, by_tiles, 8, 33, 32)
+    add_product(a, b, by_tiles, 8, 33, 32)
     add(a, b, out)
     assert np.array_equal(out[:rows, :columns], by_tiles[:rows, :columns])
     out[:rows, :columns] = before[:rows, :columns]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
@@ -29,6 +29,7 @@ from mmsynth.field.kernels.cpu.corners import (
     same_cell,
     to_unit,
 )
+from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, element, padded, splat, whole
 
 _VECTOR = ir.VectorType(ir.FloatType(), FEATURES)
@@ -128,16 +129,18 @@ def surface_layers(network: Any) -> SurfaceLayers:
     return SurfaceLayers(hidden, turned, output, network.inner_radius, network.outer_radius)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def surface_weights(hidden, output):  # type: ignore[no-untyped-def]
     """The arrays of ``SurfaceLayers``."""
     units, tiles = hidden.shape[0], padded(hidden, FIRST_FEATURE_ROW)
     out = np.zeros(tiles.shape[0] + 1, np.float32)
-    out[:units], out[-1] = output[:units], output[units]
+    for i in range(units):
+        out[i] = output[i]
+    out[-1] = output[units]
     return tiles, np.ascontiguousarray(tiles.T), out
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def encode_block(block, n, grid):  # type: ignore[no-untyped-def]
     """Fill the features of n positions."""
     unit, fractions, places, weights = of_axes(), of_axes(), places_of_corners(), of_corners()
@@ -152,7 +155,7 @@ def encode_block(block, n, grid):  # type: ignore[no-untyped-def]
                 _mix(part, places, np.int64(i), weights, block, np.int64(begin + i), np.int64(FIRST_FEATURE_ROW + FEATURES * level))
 
 
-@njit(cache=True, fastmath=_CAREFUL, nogil=True, error_model="numpy")
+@part(fastmath=_CAREFUL)
 def scatter_block(block, n, grid, gradient, level):  # type: ignore[no-untyped-def]
     """Add the features of one level, which hold gradients now, to the gradient of its table."""
     unit, fractions, places, weights = of_axes(), of_axes(), places_of_corners(), of_corners()
@@ -172,7 +175,7 @@ def scatter_block(block, n, grid, gradient, level):  # type: ignore[no-untyped-d
             i += count
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def position_block(block, n, grid, out):  # type: ignore[no-untyped-def]
     """Add the gradient to the positions that the features, which hold gradients now, imply: out (n, 3)."""
     unit, fractions, places, values, slopes = of_axes(), of_axes(), places_of_corners(), of_corners(), of_axes()
@@ -192,7 +195,7 @@ def position_block(block, n, grid, out):  # type: ignore[no-untyped-def]
                 out[begin + i, axis] += slopes[axis * AT_ONCE + i]
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def surface_block(block, hidden, out, n, grid, layers):  # type: ignore[no-untyped-def]
     """Signed distance of n positions: grid, one hidden layer of rectified units, a linear layer, and the initial spheres.
 
@@ -214,7 +217,7 @@ def surface_block(block, hidden, out, n, grid, layers):  # type: ignore[no-untyp
         out[i] = total + output[units] + min(r - inner, outer - r)
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def surface_block_backward(block, hidden, g, n, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
     """Gradients of n positions for gradients g (n,) of their distances.
 
@@ -238,7 +241,7 @@ def surface_block_backward(block, hidden, g, n, active, layers, turned_out, outp
     add_product(hidden, weights, features, rows, units, whole(FEATURES * active, TILE_COLS))
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def surface_block_positions(block, hidden, g, n, grid, layers, out):  # type: ignore[no-untyped-def]
     """After ``surface_block_backward``: gradients to the positions, out (n, 3), overwritten."""
     inner, outer = layers.inner_radius, layers.outer_radius

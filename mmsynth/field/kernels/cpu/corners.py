@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
 from mmsynth.field.kernels.constants import FEATURES, HASH_PRIMES
+from mmsynth.field.kernels.cpu.jit import inlined, part
 from mmsynth.field.kernels.cpu.matrices import whole
 
 AT_ONCE = 64  # positions
@@ -51,7 +52,7 @@ of_corners = _on_stack(types.float32, 8)
 places_of_corners = _on_stack(types.uint32, 8)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def to_unit(block, begin, n, extent, unit):  # type: ignore[no-untyped-def]
     """Positions of a block from ``begin`` on, in [0, 1]; places outside go to the border."""
     scale, half, zero, one = np.float32(0.5 / extent), np.float32(0.5), np.float32(0.0), np.float32(1.0)
@@ -62,7 +63,7 @@ def to_unit(block, begin, n, extent, unit):  # type: ignore[no-untyped-def]
             unit[axis * AT_ONCE + i] = zero
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _cell(unit, cells, last):  # type: ignore[no-untyped-def]
     """Cell index along one axis, where in the cell."""
     scaled = unit * cells
@@ -70,13 +71,13 @@ def _cell(unit, cells, last):  # type: ignore[no-untyped-def]
     return np.uint32(index), scaled - np.float32(index)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _set(out, i, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     out[i], out[AT_ONCE + i], out[2 * AT_ONCE + i], out[3 * AT_ONCE + i] = a, b, c, d
     out[4 * AT_ONCE + i], out[5 * AT_ONCE + i], out[6 * AT_ONCE + i], out[7 * AT_ONCE + i] = e, f, g, h
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def find_corners(n, unit, resolution, rows, places, fractions):  # type: ignore[no-untyped-def]
     """Where the rows of the corners begin in the table of a level [bytes], uint32, and where in their cells positions are.
 
@@ -110,14 +111,14 @@ def find_corners(n, unit, resolution, rows, places, fractions):  # type: ignore[
         )  # fmt: skip
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def same_cell(places, i, j):  # type: ignore[no-untyped-def]
     """Whether two positions have the same corners: four of the rows give the others."""
     same = places[i] == places[j] and places[AT_ONCE + i] == places[AT_ONCE + j]
     return same and places[2 * AT_ONCE + i] == places[2 * AT_ONCE + j] and places[4 * AT_ONCE + i] == places[4 * AT_ONCE + j]
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def find_weights(n, fractions, weights):  # type: ignore[no-untyped-def]
     """Trilinear weights of the corners."""
     one = np.float32(1.0)
@@ -128,7 +129,7 @@ def find_weights(n, fractions, weights):  # type: ignore[no-untyped-def]
         _set(weights, i, a * gz, a * fz, b * gz, b * fz, c * gz, c * fz, d * gz, d * fz)
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+@part(fastmath=True)
 def add_slopes(n, fractions, values, slope, out):  # type: ignore[no-untyped-def]
     """Add to ``out`` what numbers ``values`` at the corners say of the slope along each axis; slope: what a cell is [1/cell]."""
     one = np.float32(1.0)

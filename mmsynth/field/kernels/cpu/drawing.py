@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 
 from mmsynth.field.kernels.constants import DRAW_JITTER, DRAW_PIXEL, DRAW_TILE, PURPOSE_STRIDE, WORD
+from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.parameters import Cameras, Drawing, Drawn, Frames, Measured, Modalities, Selection
 
 CHUNK = 64  # rays
@@ -20,7 +21,7 @@ _u, _f = np.uint32, np.float32
 _ZERO, _ONE, _TWO, _THREE, _SIX = _f(0.0), _f(1.0), _f(2.0), _f(3.0), _f(6.0)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _scramble(x):  # type: ignore[no-untyped-def]
     """See ``drawing.scramble``."""
     x = _u(_u(x ^ _u(x >> _u(16))) * _u(0x7FEB352D))
@@ -28,14 +29,14 @@ def _scramble(x):  # type: ignore[no-untyped-def]
     return _u(x ^ _u(x >> _u(16)))
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _bits(key, number, purpose):  # type: ignore[no-untyped-def]
     """See ``drawing.random_bits``; as int64."""
     mixed = _scramble(_u(np.int64(number) + np.int64(key[0])))
     return np.int64(_scramble(_u(mixed ^ _u(np.int64(key[1]) + purpose * PURPOSE_STRIDE))))
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _first_above(ascending, begin, end, value):  # type: ignore[no-untyped-def]
     """The first of a range whose number is larger than ``value``."""
     length = end - begin
@@ -48,7 +49,7 @@ def _first_above(ascending, begin, end, value):  # type: ignore[no-untyped-def]
     return begin + (1 if length > 0 and ascending[begin] <= value else 0)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _set_bit(words, first, kth):  # type: ignore[no-untyped-def]
     """Where the kth bit is that is set, counted from the lowest of word ``first``."""
     at = 0
@@ -72,7 +73,7 @@ def _set_bit(words, first, kth):  # type: ignore[no-untyped-def]
         at += 1
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _decoded(frames, kind, at):  # type: ignore[no-untyped-def]
     if kind == 0:
         return _f(frames.codes8[at]) / _f(255.0)
@@ -81,14 +82,14 @@ def _decoded(frames, kind, at):  # type: ignore[no-untyped-def]
     return frames.floats[at]
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _cubic(t):  # type: ignore[no-untyped-def]
     """Weights of four nodes at 0, 1, 2, 3."""
     a, b, c = t - _ONE, t - _TWO, t - _THREE
     return -a * b * c / _SIX, t * b * c / _TWO, -t * a * c / _TWO, t * a * b / _SIX
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _in_camera(cameras, camera, row, column):  # type: ignore[no-untyped-def]
     """The direction of a pixel in the camera's axes."""
     step, across, first, nodes = np.int64(cameras.step[camera]), np.int64(cameras.across[camera]), cameras.first[camera], cameras.nodes
@@ -117,13 +118,13 @@ _CAMERAS, _MODALITIES, _SELECTION, _RAYS = _ENDS
 _KEY, _DRAWN, _MEASURED = _RAYS + 1, _RAYS + 2, _RAYS + 9
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def drawing_tasks(drawing):  # type: ignore[no-untyped-def]
     """How many there are."""
     return (np.int64(drawing[_DRAWN].shape[0]) + CHUNK - 1) // CHUNK
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def draw_chunk(chunk, drawing):  # type: ignore[no-untyped-def]
     """A task: some of the rays. drawing: the arrays of a ``ToFill``."""
     frames, cameras = Frames(*drawing[:_CAMERAS]), Cameras(*drawing[_CAMERAS:_MODALITIES])
@@ -205,14 +206,14 @@ def draw_chunk(chunk, drawing):  # type: ignore[no-untyped-def]
                 output[number] += channel
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def draw_rays(drawing):  # type: ignore[no-untyped-def]
     """Fills what is drawn."""
     for chunk in prange(drawing_tasks(drawing)):
         draw_chunk(np.int64(chunk), drawing)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignore[no-untyped-def]
     """See ``drawing.odds``; ``evenly``: float64. By one thread: others learn meanwhile."""
     for n in range(first_tile.shape[0] - 1):

@@ -11,12 +11,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
 from mmsynth.field.kernels.cpu.blocks import scatter_block
 from mmsynth.field.kernels.cpu.drawing import draw_chunk, drawing_tasks
+from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
 from mmsynth.field.kernels.cpu.matrices import add_sum, add_sums
 from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backward, see_mirrors
@@ -64,7 +64,7 @@ class WeightGradients(NamedTuple):
     far_light: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _learn_rays(  # type: ignore[no-untyped-def]
     chunk, slot, begin, count, total, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light,
     view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
@@ -147,7 +147,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     return loss
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-def]
     """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Hidden units and
     gradients of these samples move to the front of their arrays."""
@@ -159,7 +159,8 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
         for j in range(width):
             out[n, j] = block[i, j]
         if n < i:
-            hidden[n] = hidden[i]
+            for j in range(hidden.shape[1]):
+                hidden[n, j] = hidden[i, j]
             sdf[n] = sdf[i]
         n += 1
     kept.samples[chunk, 0] = n
@@ -171,7 +172,7 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def learn_rays(  # type: ignore[no-untyped-def]
     next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured, gain,
     opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
@@ -212,7 +213,7 @@ def learn_rays(  # type: ignore[no-untyped-def]
             return
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
     """Add to the gradients of weights, biases and lamps what each chunk found: the sum of all that they are then, finite if each is."""
     g, units = gradients, gradients.hidden.shape[0]
@@ -249,7 +250,7 @@ def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, g
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def finish(  # type: ignore[no-untyped-def]
     next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients, sums,
     places, numbers,

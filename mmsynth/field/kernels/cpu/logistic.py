@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from mmsynth.field.kernels.cpu.jit import part
 
 _LOG2E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 0.6931471803691238, 1.9082149292705877e-10
 _MOST = 700.0  # e^-700 is a number still
@@ -34,7 +36,7 @@ def _power_of_two(typingctx, exponent):  # type: ignore[no-untyped-def]
     return (types.float32 if single else types.float64)(exponent), codegen
 
 
-@njit(cache=True, fastmath={"contract", "nsz"}, nogil=True, error_model="numpy")
+@part(fastmath={"contract", "nsz"})
 def negative_log_cdf(values, n, sharpness, out, density):  # type: ignore[no-untyped-def]
     """-log Φ(s f) = softplus(-s f) of n values f, and minus its slope over s, 1 - Φ(s f); relative error below 1e-11.
 
@@ -58,7 +60,7 @@ def negative_log_cdf(values, n, sharpness, out, density):  # type: ignore[no-unt
         density[i] = (1.0 if x > 0.0 else e) / (1.0 + e)
 
 
-@njit(cache=True, fastmath={"contract", "nsz"}, nogil=True, error_model="numpy")
+@part(fastmath={"contract", "nsz"})
 def softplus(values, n, out, slope):  # type: ignore[no-untyped-def]
     """log(1 + e^x) of n numbers and its slope, 1 / (1 + e^-x), in single precision; see ``negative_log_cdf``."""
     one, two, zero = _f(1.0), _f(2.0), _f(0.0)

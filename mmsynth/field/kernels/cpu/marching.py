@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import get_thread_id, njit, prange
+from numba import get_thread_id, prange
 
 from mmsynth.field.kernels.constants import (
     ALONG_FACE,
@@ -33,6 +33,7 @@ from mmsynth.field.kernels.constants import (
     STAGES,
 )
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
+from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
 
 CHUNK = 128  # rays
@@ -45,7 +46,7 @@ _NO_CROSSING = np.float32(NO_CROSSING)
 _FACE_OVERSHOOT = np.float32(FACE_OVERSHOOT)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def contract(x, y, z):  # type: ignore[no-untyped-def]
     """Contracted position (mip-NeRF 360, eq. 10) and the distance from the centre."""
     r = np.float32(math.sqrt(x * x + y * y + z * z))
@@ -55,7 +56,7 @@ def contract(x, y, z):  # type: ignore[no-untyped-def]
     return x * k, y * k, z * k, r
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Change of the contracted position per unit of ray distance, for a point at distance r from the centre."""
     if r <= np.float32(1.0):
@@ -67,7 +68,7 @@ def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
     return dx * across + ux * radial, dy * across + uy * radial, dz * across + uz * radial
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted, skipped):  # type: ignore[no-untyped-def]
     """t, position, distance from the centre, speed and state: at t where a surface may be there, else, with the state of a free cell,
     behind that cell. skipped: whether the ray comes from one."""
@@ -117,7 +118,7 @@ def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted
     return max(t + leave, t * _LEAST_ADVANCE), cx, cy, cz, r, speed, state
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def section_depth(before, after, first):  # type: ignore[no-untyped-def]
     """See ``reference.section_depth``, of -log Φ(s f) at both ends."""
     rise = after - before
@@ -125,7 +126,7 @@ def section_depth(before, after, first):  # type: ignore[no-untyped-def]
     return rise + (before - LN2) if first and before > LN2 else rise
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):  # type: ignore[no-untyped-def]
     """Samples of the rays of a chunk and their distances, see ``reference.march``: how many."""
     contracted = grid.extent > np.float32(1.0)
@@ -152,7 +153,8 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     while going > 0 or waiting < count:
         n = np.int64(0)
         pending = going
-        todo[:going] = lanes[:going]
+        for i in range(going):
+            todo[i] = lanes[i]
         while pending < LANES and waiting < count:
             todo[pending] = waiting
             pending += 1
@@ -224,7 +226,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     return used
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def find_sections(begin, count, slot, rays, contracted, sampling, store, weight, depth):  # type: ignore[no-untyped-def]
     """Weights of the sections of a chunk's rays: depth, and the sections that matter, in the order of the rays: how many.
 
@@ -293,7 +295,7 @@ def find_sections(begin, count, slot, rays, contracted, sampling, store, weight,
     return sections
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def composite(begin, count, slot, sections, appearance, store, features, distance, shown):  # type: ignore[no-untyped-def]
     """Features and distance of a chunk's rays: the mean over the sections of each surface, (2, R, F) and (2, R)."""
     s_block, width = store.s_block[slot], FEATURES * appearance.active
@@ -317,7 +319,7 @@ def composite(begin, count, slot, sections, appearance, store, features, distanc
                 features[which, begin + i, j] *= scale
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def trace_forward(rays, states, sampling, grid, layers, appearance, keep, store, out):  # type: ignore[no-untyped-def]
     """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
     total, samples = rays.origins.shape[0], out.samples  # in a parallel loop, numba would not set a tuple's arrays

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from mmsynth.field.kernels.cpu.jit import inlined, part
 
 TILE_ROWS, TILE_COLS = 4, 16
 # Sums of four tiles at once fit into AVX-512's 32 registers of 16 numbers. AVX2 has 16 of 8, half of them for one tile: more would spill,
@@ -82,7 +84,7 @@ def _tile(height: int, vectors: int) -> Any:
 _high_and_wide, _high, _wide, _small = _tile(8, 2), _tile(8, 1), _tile(4, 2), _tile(4, 1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def]
     """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
     row = 0
@@ -103,14 +105,14 @@ def add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def
         row += 8 if high else TILE_ROWS
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def clear(out, rows, columns):  # type: ignore[no-untyped-def]
     for i in range(rows):
         for j in range(columns):
             out[i, j] = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def add_sum(parts, out):  # type: ignore[no-untyped-def]
     """out += the sum of matrices (N, ≥ rows, ≥ columns) in their order."""
     rows, columns = out.shape
@@ -124,7 +126,7 @@ def add_sum(parts, out):  # type: ignore[no-untyped-def]
             out[i, j] += total[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def add_sums(parts, out):  # type: ignore[no-untyped-def]
     """The same of vectors (N, ≥ columns)."""
     for j in range(out.shape[0]):
@@ -134,16 +136,18 @@ def add_sums(parts, out):  # type: ignore[no-untyped-def]
         out[j] += total
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined(cache=True)
 def whole(count, of):  # type: ignore[no-untyped-def]
     """``count`` rounded up to a multiple."""
     return (count + of - 1) // of * of
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def padded(matrix, first=0):  # type: ignore[no-untyped-def]
     """A copy of whole tiles, whichever way round it is used; of the columns those behind the ``first``."""
     rows, width = matrix.shape
     out = np.zeros((whole(rows, TILE_COLS), first + whole(width - first, TILE_COLS)), np.float32)
-    out[:rows, :width] = matrix
+    for i in range(rows):
+        for j in range(width):
+            out[i, j] = matrix[i, j]
     return out

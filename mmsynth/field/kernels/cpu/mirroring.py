@@ -10,9 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from mmsynth.field.kernels.constants import LEAST_ROUGHNESS, REFRACTIVE_INDEX
+from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import softplus
 from mmsynth.field.kernels.cpu.shading import first_at
 
@@ -34,7 +35,7 @@ class Gradients(NamedTuple):
     spectrum: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _materials(begin, end, mirrors, behind):  # type: ignore[no-untyped-def]
     """log(1 + e^x) and its slope, of the materials x of what some rays meet, ray by ray: (surfaces, 5 + K) each."""
     width, n = mirrors.material.shape[1], 0
@@ -52,7 +53,7 @@ def _materials(begin, end, mirrors, behind):  # type: ignore[no-untyped-def]
     return soft, gate
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _terms(row, k, lamps, mirrors, polarized, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.reflect``, of one surface and lamp.
 
@@ -90,7 +91,7 @@ def _terms(row, k, lamps, mirrors, polarized, out):  # type: ignore[no-untyped-d
     out[20] = (s * s - p * p) / (s * s + p * p)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _amount(alpha, strength, visible, terms):  # type: ignore[no-untyped-def]
     """Relative light of one surface and lamp; fills A and B of the terms."""
     square, c = alpha * alpha, _f(0.5) * alpha
@@ -100,7 +101,7 @@ def _amount(alpha, strength, visible, terms):  # type: ignore[no-untyped-def]
     return u * u * terms[12] / (terms[14] * terms[15]) * terms[16] * strength * visible
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _around(row, mirrors, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.surround``, of one surface. out: w 0:3, |w|² 3, F / F(1) 4, D_m and D_t over sin² 5, 6."""
     vx, vy, vz = -mirrors.directions[row, 0], -mirrors.directions[row, 1], -mirrors.directions[row, 2]
@@ -116,7 +117,7 @@ def _around(row, mirrors, out):  # type: ignore[no-untyped-def]
     out[6] = less * less / (_ONE + (product + along) * (product + along))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _reflect_rows(begin, end, lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
     """``reflect`` of some surfaces."""
     count, width = lamps.position.shape[0], mirrors.material.shape[1]
@@ -132,7 +133,7 @@ def _reflect_rows(begin, end, lamps, mirrors, amount, axis, degree):  # type: ig
             degree[row, k] = terms[20] * gate[i, 4]
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def reflect(lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
     """See ``mirroring.reflect``."""
     surfaces = mirrors.points.shape[0]
@@ -141,14 +142,14 @@ def reflect(lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-de
         _reflect_rows(begin, min(begin + CHUNK, surfaces), lamps, mirrors, amount, axis, degree)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
     """Share of the light behind an analyser."""
     e = terms[17] * axes[number, 0] + terms[18] * axes[number, 1] + terms[19] * axes[number, 2]
     return _f(0.5) * (_ONE + terms[20] * (_TWO * e * e - _ONE))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """``mirror`` of some rays; ray0 + begin: the first of them in ``measured.ray``."""
     count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
@@ -185,7 +186,7 @@ def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # typ
                     out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.mirror``; ``measured.ray`` never decreases."""
     rays = behind.shape[0]
@@ -194,7 +195,7 @@ def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-de
         mirror_rays(begin, min(begin + CHUNK, rays), np.int64(0), lamps, mirrors, behind, measured, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """``mirror_backward`` of some rays; gradients of the lamps are added to those of the chunk."""
     count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
@@ -297,7 +298,7 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
             g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate[place, 0] * (_ONE - gate[place, 0])
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """g: (M,) gradients of the numbers; out: ``Gradients``."""
     rays, g_position, g_spectrum = behind.shape[0], out.position, out.spectrum

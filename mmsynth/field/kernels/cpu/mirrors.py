@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.kernels.cpu import mirroring
+from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, contract, velocity
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, whole
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
@@ -55,7 +55,7 @@ class ChunkScratch(NamedTuple):
     gh: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def lamps_and_layers(light):  # type: ignore[no-untyped-def]
     """Of a ``LightNetwork``: which outputs of its last layer there are (5 + K,), the lamps that there are, its layers with these."""
     parts = len(light.second_bias) - len(light.position)
@@ -77,7 +77,7 @@ class LightOut(NamedTuple):
     loss: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def mix(count, far_light, features, share, opacity, behind, mixed, mixed_share):  # type: ignore[no-untyped-def]
     """See ``learning.with_far_light``."""
     width = features.shape[1]
@@ -85,7 +85,8 @@ def mix(count, far_light, features, share, opacity, behind, mixed, mixed_share):
         for which in range(2 if behind[i] >= 0 else 1):
             row = i if which == 0 else behind[i]
             mixed_share[row] = share[row]
-            mixed[row] = features[row]
+            for j in range(width):
+                mixed[row, j] = features[row, j]
         row = behind[i] if behind[i] >= 0 else i
         passed = _ONE - opacity[i]
         mixed_share[row] += passed
@@ -94,7 +95,7 @@ def mix(count, far_light, features, share, opacity, behind, mixed, mixed_share):
             mixed[row, j] += part * (far_light[j] - mixed[row, j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def mix_backward(begin, end, far_light, features, share, opacity, behind, mixed_share, g_features, g_share, g_far):  # type: ignore[no-untyped-def]
     """Gradients of what is shaded, g_features and g_share, become those of what was met, of some of the rays."""
     width = features.shape[1]
@@ -118,7 +119,7 @@ def mix_backward(begin, end, far_light, features, share, opacity, behind, mixed_
             g_share[behind[i]] -= g_passed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, epsilon, mirrored):  # type: ignore[no-untyped-def]
     """Surfaces of some rays as mirrors: points, slopes, normals, material, and the light that they mirror. Blocks are added to ``taps``."""
     s, behind = scratch, scratch.behind[slot]
@@ -171,7 +172,7 @@ def see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch,
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def mirrors_backward(  # type: ignore[no-untyped-def]
     begin, count, n, first, ray0, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor, g_mirrored,
     out

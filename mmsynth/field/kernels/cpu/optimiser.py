@@ -7,12 +7,13 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numba import njit, prange, types
+from numba import prange, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from torch import Tensor
 
 from mmsynth.field.kernels.constants import FEATURES
+from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.tasks import take, wait
 from mmsynth.field.kernels.parameters import AdamPart, AdamStep
 
@@ -22,7 +23,7 @@ ADAM_CHUNK = 16384  # parameters at a time
 _FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}  # NaN stays what it is: no gradient of 0
 
 
-@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+@part(fastmath=_FAST)
 def adam_part(p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
     """``rate`` includes the first bias correction, ``root`` is one over the square root of the second."""
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -52,7 +53,7 @@ def _at(typingctx, address, count):  # type: ignore[no-untyped-def]
     return kind(types.int64, types.int64), codegen
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def take_parts(next_task, task, others, done, places, numbers):  # type: ignore[no-untyped-def]
     """``adam_part`` of N tensors, from a task that was taken on until there are none; the counter counts so many others before them.
 
@@ -76,7 +77,7 @@ def take_parts(next_task, task, others, done, places, numbers):  # type: ignore[
         task = take(next_task, 0) - others
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def adam_tensor(p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
     """``adam_part`` of a whole tensor (N,)."""
     for task in prange((len(p) + ADAM_CHUNK - 1) // ADAM_CHUNK):

@@ -13,9 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_thread_id, njit, prange
+from numba import get_thread_id, prange
 
 from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
+from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
 
 CHUNK = 64  # rays
@@ -23,7 +24,7 @@ _HUBER = np.float32(HUBER_DELTA)
 _FAST = {"contract", "reassoc", "nsz", "arcp"}  # but NaN stays NaN: a loss that is not finite must be seen
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     """Real spherical harmonics (see ``reference.spherical_harmonics``); terms above the degree are left as they are."""
     f = np.float32
@@ -52,7 +53,7 @@ def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     out[15] = f(0.5900435899266435) * x * (xx - f(3.0) * yy)
 
 
-@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+@part(fastmath=_FAST)
 def layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
     """out = rectified (x @ weight + bias), of n rays. weight: (inputs, units)."""
     rows, units = whole(n, TILE_ROWS), out.shape[1]
@@ -67,7 +68,7 @@ def layer(n, x, inputs, weight, bias, out):  # type: ignore[no-untyped-def]
             out[i, k] = np.float32(0.0) if v <= np.float32(0.0) else v
 
 
-@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+@part(fastmath=_FAST)
 def layer_backward(n, x, inputs, g, out, weight_out, bias_out):  # type: ignore[no-untyped-def]
     """Gradients of a layer's weights (units, inputs); g: those of what came out, then those before the rectification."""
     units = g.shape[1]
@@ -78,7 +79,7 @@ def layer_backward(n, x, inputs, g, out, weight_out, bias_out):  # type: ignore[
     add_product(g.T, x, weight_out, units, n, inputs)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _softplus(x):  # type: ignore[no-untyped-def]
     """log (1 + exp x), and its slope."""
     one = np.float32(1.0)
@@ -86,7 +87,7 @@ def _softplus(x):  # type: ignore[no-untyped-def]
     return max(x, np.float32(0.0)) + np.float32(math.log1p(small)), (one if x > np.float32(0.0) else small) / (one + small)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
     """|Lᵀ e|² (see ``shading.intensity`` of the definition) and its slope, both of six numbers."""
     two = np.float32(2.0)
@@ -101,7 +102,7 @@ def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
     return v0 * v0 + v1 * v1 + v2 * v2
 
 
-@njit(cache=True, fastmath=_FAST, nogil=True, error_model="numpy")
+@part(fastmath=_FAST)
 def _measurements(  # type: ignore[no-untyped-def]
     ray0, span, place_of, share, hidden, trains, measured, gain, mirrored, heads, heads_bias, learn, squared, g_hidden, g_share, g_gain,
     g_mirrored, heads_out, heads_bias_out,
@@ -171,7 +172,7 @@ def _measurements(  # type: ignore[no-untyped-def]
     return loss
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def first_at(ray, begin):  # type: ignore[no-untyped-def]
     """The first measurement of a ray or of those after it, by bisection."""
     low, high = 0, len(ray)
@@ -195,13 +196,13 @@ class Layers(NamedTuple):
     second_bias: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def two_layers(first, first_bias, second, second_bias):  # type: ignore[no-untyped-def]
     """Weights (units, inputs) and biases as the kernels take them."""
     return Layers(padded(first), padded(first.T), first_bias, padded(second), padded(second.T), second_bias)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def clear_gradients(store, chunk):  # type: ignore[no-untyped-def]
     """Of weights, of one chunk."""
     store.first_out[chunk], store.second_out[chunk], store.heads_out[chunk] = np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -209,7 +210,7 @@ def clear_gradients(store, chunk):  # type: ignore[no-untyped-def]
     store.heads_bias_out[chunk] = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def compare_rays(  # type: ignore[no-untyped-def]
     begin, count, ray0, slot, chunk, rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, squared, g_features, g_share,
     g_gain, g_mirrored,
@@ -263,7 +264,7 @@ def compare_rays(  # type: ignore[no-untyped-def]
     return loss
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def compare(  # type: ignore[no-untyped-def]
     rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, loss, squared, g_features, g_share, g_gain, g_mirrored
 ):
@@ -284,7 +285,7 @@ def compare(  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """Outputs of n rays. heads: (H, outputs), whole tiles."""
     first, second = layers.first_turned, layers.second_turned
@@ -305,7 +306,7 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
             outputs[begin + i, k] = out[i, k] + heads_bias[k]
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def shade(features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """See ``reference.shade``, of rays that all have one degree."""
     rays, turned = len(features), padded(heads.T)

@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from mmsynth.field.kernels.cpu.blocks import surface_block, surface_block_backward
+from mmsynth.field.kernels.cpu.jit import part
 from mmsynth.field.kernels.cpu.marching import CHUNK, contract
 from mmsynth.field.kernels.learning import TAPS
 
@@ -30,7 +30,7 @@ class TapStore(NamedTuple):
     output_out: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: ignore[no-untyped-def]
     """See ``learning.surface_gradient``: of n points ``at`` (n, 3), whose taps are kept in the slot of ``taps`` behind what is there."""
     move, scale = epsilon / _f(math.sqrt(3.0)), _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
@@ -54,7 +54,7 @@ def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: i
         taps.used[slot, 0] = used + 4 * count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  # type: ignore[no-untyped-def]
     """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
     scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
@@ -73,7 +73,7 @@ def slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  #
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def pull_to_one(slope, factor, shallow, g):  # type: ignore[no-untyped-def]
     """``factor`` (|slope| - 1)², times ``shallow`` below 1; its gradient is added to g (3,)."""
     norm = _f(math.sqrt(slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2]))
@@ -85,12 +85,12 @@ def pull_to_one(slope, factor, shallow, g):  # type: ignore[no-untyped-def]
     return np.float64(factor * off * off)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def is_within(p):  # type: ignore[no-untyped-def]
     return math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) < _ONE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, scratch, slot, taps):  # type: ignore[no-untyped-def]
     """The pull at some of the points of all space: its part of the loss."""
     at, found = points[begin : begin + count], scratch.found[slot]
@@ -104,7 +104,7 @@ def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, sc
     return loss
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps):  # type: ignore[no-untyped-def]
     """The pull near the surfaces that some of the rays meet (see ``learning.asked_rays``): its part of the loss."""
     wide, n, asked = grid.extent > _ONE, np.int64(0), np.int64(min(len(eikonal.noise), total))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import get_thread_id, njit, prange
+from numba import get_thread_id, prange
 
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.cpu.blocks import (
@@ -12,6 +12,7 @@ from mmsynth.field.kernels.cpu.blocks import (
     surface_block_backward,
     surface_block_positions,
 )
+from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.tasks import take
 
 POINTS = 128  # positions of a block
@@ -20,7 +21,7 @@ _f = np.float32
 _ZERO, _ONE, _MOST = _f(0.0), _f(1.0), _f(253 - OUTSIDE)
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def surface_forward(positions, grid, layers, keep, store, out):  # type: ignore[no-untyped-def]
     """Signed distance of (N, 3) positions; store: see ``SurfaceStore``, a slot per block when ``keep``, else per thread."""
     count = positions.shape[0]
@@ -36,7 +37,7 @@ def surface_forward(positions, grid, layers, keep, store, out):  # type: ignore[
         surface_block(b, store.hidden[slot], out[begin : begin + n], n, grid, layers)
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def surface_backward(gradient, active, layers, store):  # type: ignore[no-untyped-def]
     """Gradients of the weights per block; hidden units and features become gradients."""
     turned_out, output_out = store.turned_out, store.output_out  # in a parallel loop, numba would not set a tuple's arrays
@@ -51,7 +52,7 @@ def surface_backward(gradient, active, layers, store):  # type: ignore[no-untype
         )
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def surface_positions(gradient, grid, layers, store, positions_out):  # type: ignore[no-untyped-def]
     """After ``surface_backward``: gradients of the positions (N, 3)."""
     count = gradient.shape[0]
@@ -62,7 +63,7 @@ def surface_positions(gradient, grid, layers, store, positions_out):  # type: ig
         surface_block_positions(store.block[chunk], store.hidden[chunk], gradient[begin : begin + n], n, grid, layers, out)
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def surface_scatter(count, grid, store, gradient):  # type: ignore[no-untyped-def]
     """The table's gradient, one task per level."""
     for task in prange(grid.active):
@@ -71,7 +72,7 @@ def surface_scatter(count, grid, store, gradient):  # type: ignore[no-untyped-de
             scatter_block(store.block[chunk], np.int64(min(POINTS, count - chunk * POINTS)), grid, gradient, level)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _classify_block(n, where, states, cells, grid, layers, block, hidden, value):  # type: ignore[no-untyped-def]
     """States of n cells, whose centres the block holds."""
     surface_block(block, hidden, value, n, grid, layers)
@@ -82,7 +83,7 @@ def _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
             states[where[i]] = np.uint8(SOLID if value[i] < -cells.margin else SHELL)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def _classify_cells(next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
     """Take tasks until there are none."""
     slot, side, n = take(next_task, 1), len(centre), 0
@@ -108,7 +109,7 @@ def _classify_cells(next_task, states, centre, cells, grid, layers, store):  # t
     _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def classify(threads, next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
     """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. next_task: (2,), see ``learn_rays``. store: a slot
     for each thread."""

@@ -10,8 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from mmsynth.field.kernels.cpu.jit import kernel
 
 T = TypeVar("T")
 
@@ -49,7 +51,7 @@ def _told(typingctx, flags, index):  # type: ignore[no-untyped-def]
     return types.int64(flags, types.int64), codegen
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def wait(flags, index):  # type: ignore[no-untyped-def]
     """Until ``tell`` was called. It spins: for what another thread has begun already, and is about to end."""
     while _told(flags, index) == 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, LN2, MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cpu.blocks import (
@@ -14,12 +14,13 @@ from mmsynth.field.kernels.cpu.blocks import (
     surface_block_backward,
     surface_block_positions,
 )
+from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
 
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store):  # type: ignore[no-untyped-def]
     """Distances and features of the sections become their gradients, of the rays in a slot of the store, of which ``begin`` is the first in
     ``behind``."""
@@ -69,7 +70,7 @@ def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, s
                 sdf[chunk, id_of[chunk, end]] -= np.float32(d_tau * q_of[chunk, end])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@part()
 def samples_backward(block, hidden, g, samples, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
     """``surface_block_backward`` of many samples, a part at a time."""
     for used in range(0, samples, LANES):
@@ -77,7 +78,7 @@ def samples_backward(block, hidden, g, samples, active, layers, turned_out, outp
         surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def trace_backward(  # type: ignore[no-untyped-def]
     behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
@@ -104,7 +105,7 @@ def trace_backward(  # type: ignore[no-untyped-def]
         )
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def trace_scatter(rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
     chunks = (rays + CHUNK - 1) // CHUNK
@@ -117,7 +118,7 @@ def trace_scatter(rays, grid, appearance, store, gradient, a_gradient):  # type:
                 scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@inlined()
 def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-def]
     """Gradient to a position from the gradient to its contraction."""
     r = np.float32(math.sqrt(x * x + y * y + z * z))
@@ -128,7 +129,7 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
     return k * gx + change * x, k * gy + change * y, k * gz + change * z
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@kernel(parallel=True)
 def trace_rays_backward(origins, directions, grid, layers, appearance, store, origins_out, directions_out):  # type: ignore[no-untyped-def]
     """After ``trace_backward``: gradients to origins and directions, with the samples' ray distances held fixed."""
     rays = origins.shape[0]
