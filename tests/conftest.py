@@ -169,6 +169,35 @@ if INTERPRETED:
             patch_language(function)
         return interpreter._LangPatchScope()  # has nothing to restore
 
+    # a third of its time goes into names of types, which nobody reads, and into a table of all for each look at one
+    from triton.language import core
+
+    def name_of(self: Any) -> str:
+        return "[" + ",".join(f"{field}:{kind}" for field, kind in zip(self.fields, self.types, strict=True)) + "]"
+
+    def keep_types(self: Any, types: Any, fields: Any = None) -> None:
+        self.types, self.fields = types, fields or [""] * len(types)
+
+    def keep_values(self: Any, args: Iterable[Any], type: Any = None) -> None:
+        self.values = list(args)
+        self.known_type = type if type is None or isinstance(type, core.tuple_type) else core.tuple_type(type)
+
+    def type_of(self: Any) -> Any:
+        if self.known_type is None:
+            self.known_type = core._type_for_tuple_values(self.values)
+        return self.known_type
+
+    core.tuple_type.__init__, core.tuple_type.name = keep_types, property(name_of)
+    core.tuple.__init__, core.tuple.type = keep_values, property(type_of, lambda self, type: setattr(self, "known_type", type))
+    find_dtype, dtypes = interpreter._get_np_dtype, {}
+
+    def dtype_of(kind: Any) -> np.dtype[Any]:
+        name = kind.scalar.name
+        if name not in dtypes:
+            dtypes[name] = find_dtype(kind.scalar)
+        return dtypes[name]
+
+    interpreter._get_np_dtype = dtype_of
     interpreter._patch_lang_tensor = patch_tensor_and_index
     interpreter._patch_lang = patch_once
 
