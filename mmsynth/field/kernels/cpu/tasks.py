@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from mmsynth.field.kernels.cpu.jit import kernel
+from mmsynth.field.kernels.cpu.jit import part
 
 T = TypeVar("T")
 
@@ -51,7 +51,7 @@ def _told(typingctx, flags, index):  # type: ignore[no-untyped-def]
     return types.int64(flags, types.int64), codegen
 
 
-@kernel()
+@part()
 def wait(flags, index):  # type: ignore[no-untyped-def]
     """Until ``tell`` was called. It spins: for what another thread has begun already, and is about to end."""
     while _told(flags, index) == 0:
