@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from from_python import from_python
-from numba import njit
 
 from mmsynth.field.kernels.cpu import matrices
 
@@ -34,14 +33,10 @@ def test_a_product_is_added(rows: int, inner: int, columns: int) -> None:
 def test_large_tiles_add_the_same_bits(tile: Any, rows: int, columns: int) -> None:
     """A CPU without AVX-512 takes the smallest alone, and comes to the same field."""
 
-    @njit(error_model="numpy")
-    def add(a, b, out):  # type: ignore[no-untyped-def]
-        tile(a, b, out, 0, a.shape[1], 0)
-
     a, b, out = _matrices(8, 33, 32)
     by_tiles, before = out.copy(), out.copy()
     add_product(a, b, by_tiles, 8, 33, 32)
-    add(a, b, out)
+    from_python(tile)(a, b, out, 0, a.shape[1], 0)
     assert np.array_equal(out[:rows, :columns], by_tiles[:rows, :columns])
     out[:rows, :columns] = before[:rows, :columns]
     assert np.array_equal(out, before)  # nothing beside
