@@ -22,7 +22,7 @@ A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. 
 does not wait for torch.
 
 The command line sets ``GOMP_SPINCOUNT=1000`` before torch is loaded, so that its threads do not spin beside another busy process; a script
-that shares its machine may want the same. ``OMP_NUM_THREADS`` limits numba's threads, too, there; in a script, ``NUMBA_NUM_THREADS``.
+that shares its machine may want the same. ``OMP_NUM_THREADS`` limits the threads of kernels, too.
 """
 
 from __future__ import annotations

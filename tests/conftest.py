@@ -6,12 +6,11 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -20,6 +19,7 @@ from few_looks import few_looks
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
+from mmsynth.threads import kernel_threads, let_kernels_have
 
 WIDTH, HEIGHT = 24, 18
 sys.path.append(str(Path(__file__).parent / "field"))  # cases of the CPU's kernels are those of Triton's
@@ -30,7 +30,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if "PYTEST_XDIST_WORKER" in os.environ:
     # two threads a process on two cores wait for each other at every barrier; a test may still ask for more
     torch.set_num_threads(1)
-    numba.set_num_threads(1)
+    let_kernels_have(1)
     os.environ["OMP_NUM_THREADS"] = "1"  # of commands that tests start
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -119,6 +119,14 @@ def write_transforms(tmp_path: Path) -> Callable[..., Path]:
 def decided_by_few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """For a fit in a test of something else."""
     few_looks(monkeypatch)
+
+
+@pytest.fixture
+def use_threads() -> Iterator[Callable[[int], None]]:
+    """Give so many threads to kernels that the test calls."""
+    before = kernel_threads()
+    yield let_kernels_have
+    let_kernels_have(before)
 
 
 # --- the table of hard cases: pytest tests/hard_cases --hard-cases FILE

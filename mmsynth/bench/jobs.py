@@ -31,7 +31,6 @@ from mmsynth.operations.export.demosaicked import write_demosaicked
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import MaskMeaning, Scene, keep_frames
-from mmsynth.threads import let_numba_follow
 
 Input = Literal["raw", "demosaicked"]
 """What is learned from: frames as they were recorded, or demosaicked and undistorted ones (``write_demosaicked``)."""
@@ -175,7 +174,6 @@ def in_a_process(module: str, task: Mapping[str, Any], name: str) -> dict[str, A
         command = [sys.executable, "-m", module, json.dumps(task), folder]
         path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, "PYTHONPATH": path}
-        let_numba_follow(environment)
         # nothing is ever written to its standard input: that it closes tells the child that nobody waits for the result. Ctrl-C is for
         # this process alone (a session of its own): a second signal would not let the child write its checkpoint
         with subprocess.Popen(

@@ -332,9 +332,9 @@ def bench_kernels(samples: int, out: Path, threads: int | None = None, progress:
     """Time and check every backend of every operation.
 
     Args:
-        samples: per call. threads: of torch and numba; None: as they are. progress: called with (operations done, operations in all).
+        samples: per call. threads: of torch and kernels; None: as they are. progress: called with (operations done, operations in all).
     Raises:
-        InputError: more threads than numba was started with; ``out`` cannot be written.
+        InputError: more threads than cores; ``out`` cannot be written.
     """
     rows: list[dict[str, Any]] = []
     with use_threads(threads):

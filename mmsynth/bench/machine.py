@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from mmsynth.errors import InputError
-from mmsynth.threads import usable_cores
+from mmsynth.threads import kernel_threads, let_kernels_have, usable_cores
 from mmsynth.version import __version__
 
 # instruction sets that decide the speed of the kernels
@@ -54,25 +54,24 @@ def measure() -> dict[str, Any]:
 
 @contextmanager
 def use_threads(count: int | None) -> Iterator[None]:
-    """Run torch and numba on ``count`` threads; None: leave them as they are.
+    """Run torch and kernels on ``count`` threads; None: leave them as they are.
 
     Raises:
-        InputError: numba was started with fewer.
+        InputError: there are fewer cores.
     """
     if count is None:
         yield
         return
-    before = torch.get_num_threads(), numba.get_num_threads()
-    most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    before, most = (torch.get_num_threads(), kernel_threads()), usable_cores()
     if count > most:
-        raise InputError(f"--threads {count}: numba was started with {most} (NUMBA_NUM_THREADS), expected no more.")
+        raise InputError(f"--threads {count}: expected no more than the {most} cores that this process may run on.")
     try:
         torch.set_num_threads(count)
-        numba.set_num_threads(count)
+        let_kernels_have(count)
         yield
     finally:
         torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
+        let_kernels_have(before[1])
 
 
 def peak_memory() -> int:

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,6 +32,7 @@ from mmsynth.field.tiles import side_by_side
 from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
+from mmsynth.threads import kernel_threads
 
 REPEATS = 5
 VIEWS, RAYS = 4, 65536
@@ -249,8 +249,8 @@ def tiles(case: RenderCase) -> list[Variant]:
 
 
 def threads(case: RenderCase) -> list[Variant]:
-    """Threads, from one to as many as numba was started with, by doubling."""
-    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    """Threads, from one to as many as kernels have here, by doubling."""
+    most = kernel_threads()
     counts = sorted({*(2**i for i in range(most.bit_length()) if 2**i <= most), most})
     return _variants(case, {f"{n} threads": {"threads": n} for n in counts})
 
@@ -273,9 +273,9 @@ def bench_render(
     """Run all families, or those named in ``only``.
 
     Args:
-        scene: whose views are rendered. threads: of torch and numba; None: as they are. repeats: of each timing.
+        scene: whose views are rendered. threads: of torch and kernels; None: as they are. repeats: of each timing.
     Raises:
-        InputError: an unknown name, a scene without frames, more threads than numba was started with, or ``out`` cannot be written.
+        InputError: an unknown name, a scene without frames, more threads than cores, or ``out`` cannot be written.
     """
     families = chosen_families(FAMILIES, "render", only)
     with use_threads(threads):

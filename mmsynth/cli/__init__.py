@@ -8,7 +8,6 @@ import os
 
 from mmsynth.cli import bench, capture, fields, looking, products
 from mmsynth.cli.terminal import app
-from mmsynth.threads import let_numba_follow
 
 __all__ = ["app", "bench", "capture", "fields", "looking", "main", "products"]
 
@@ -18,5 +17,4 @@ def main() -> None:
     # OpenMP's threads spin for milliseconds at every barrier by default, which stalls a fit beside another busy process. A short spin
     # costs nothing alone and was 1.6 times as fast beside one. Read when torch is loaded; a user's own setting stays.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    let_numba_follow(os.environ)
     app()

@@ -106,7 +106,7 @@ def bench_size(
 @command("kernels", of=bench_app)
 def bench_kernels(
     samples: Annotated[int, typer.Option(min=64, help="samples per call")] = 65536,
-    threads: Annotated[int | None, typer.Option(min=1, help="default: those of torch and numba")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="default: those of torch and kernels")] = None,
     out: Annotated[Path, typer.Option()] = Path("bench/kernels"),
     as_json: JsonOption = False,
 ) -> None:
@@ -231,7 +231,7 @@ def bench_twin(
 def bench_render(
     run: RunOption = None,
     only: Annotated[str | None, typer.Option(help="termination, steps, asked, tiles, threads; default: all")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="default: those of torch and numba")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="default: those of torch and kernels")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="of each timing")] = 5,
     out: Annotated[Path, typer.Option()] = Path("bench/render"),
     as_json: JsonOption = False,

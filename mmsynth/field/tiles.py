@@ -16,22 +16,22 @@ from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import numba
 import torch
+
+from mmsynth.threads import kernel_threads, let_kernels_have
 
 P = TypeVar("P")
 T = TypeVar("T")
 
 _AHEAD = 4  # tiles of each thread that are begun before the first of them is asked for
-_SAFE = ("omp", "tbb")  # numba's threading layers that may be called by several threads; the last resort, workqueue, ends the process
 
 
 def side_by_side(work: Callable[[P], T], tiles: Iterable[P]) -> Iterator[tuple[P, T]]:
     """What ``work`` makes of each tile, in their order; tiles are made as they are needed. What it makes may not depend on threads.
 
-    Where there are fewer tiles than threads, or numba's threads may not be shared, all threads work on one tile after the other.
+    Where there are fewer tiles than threads, all threads work on one tile after the other.
     """
-    coming, threads = iter(tiles), _threads()
+    coming, threads = iter(tiles), kernel_threads()
     first = list(itertools.islice(coming, threads))
     if threads == 1 or len(first) < threads:
         for tile in itertools.chain(first, coming):
@@ -60,21 +60,15 @@ def tile_by_tile(device: torch.device, work: Callable[[P], T], tiles: Iterable[P
     return side_by_side(work, tiles) if device.type == "cpu" else ((tile, work(tile)) for tile in tiles)
 
 
-def _threads() -> int:
-    """Threads that tiles may have, those that numba is to use."""
-    count = numba.get_num_threads()  # starts them, so that their layer is known
-    return count if numba.threading_layer() in _SAFE else 1
-
-
 @functools.cache
 def _alone(threads: int) -> ThreadPoolExecutor:
-    """So many threads, in each of which torch and numba have that thread alone."""
+    """So many threads, in each of which torch and kernels have that thread alone."""
     pool, all_there = ThreadPoolExecutor(threads, "tile"), threading.Barrier(threads)
     own = torch.get_num_threads()
 
     def settle() -> None:
         all_there.wait()
-        numba.set_num_threads(1)
+        let_kernels_have(1)
         torch.get_num_threads()  # a thread that has not asked takes on, when it first does, what was set last in any
         torch.set_num_threads(1)
 

@@ -67,7 +67,7 @@ def _small() -> tuple[Surface, HashGrid, kernels.ShaderWeights, kernels.Measured
 
 
 def run_operations() -> None:
-    """Call each kernel that renders, with gradients."""
+    """Call each kernel but those of a step, with gradients."""
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
         surface, appearance, weights, measured = _small()
         origins, directions = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True), torch.tensor([[0.0, 0.0, 1.0]])
@@ -83,10 +83,13 @@ def run_operations() -> None:
         kernels.classify(Occupancy(4).states, kernels.Cells(1.0, 1, 0, 0.1, 2.0), *surface.at(1))
         kernels.shade(weights, hits.features, directions, 0)
         kernels.reflect(lamps.position, mirrors)
+        parameter, gradient, first, second = torch.zeros(4, 1)
+        kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
+    _draw()
 
 
 def run_steps() -> None:
-    """Call each kernel of a step: a tiny fit."""
+    """Call both kernels of a step: a tiny fit."""
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
         surface, appearance, weights, measured = _small()
         none, one, index = torch.empty(0), torch.ones(1), torch.zeros(1, dtype=torch.int64)
@@ -97,9 +100,6 @@ def run_steps() -> None:
             kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
         )  # fmt: skip
         kernels.learn(kernels.arrange(step))
-    _draw()
-    parameter, gradient, first, second = torch.zeros(4, 1)
-    kernels.adam(parameter, gradient, first, second, kernels.AdamStep(1e-3, 0.9, 0.99, 1e-15, 1))
 
 
 _HALVES = (run_steps, run_operations)  # of about as much to compile

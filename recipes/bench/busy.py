@@ -44,7 +44,7 @@ def compare(
             found[count].append(json.loads(done.stdout))
     cores, threads = len(os.sched_getaffinity(0)), round(found[0][0]["threads"])
     median = lambda count, key: statistics.median(result[key] for result in found[count])
-    print(f"{cores} cores, {threads} threads, {found[0][0]['layer']}; {repeats} fits each of {steps} steps")
+    print(f"{cores} cores, {threads} threads; {repeats} fits each of {steps} steps")
     print("busy  steps/s  (all)                CPU s/step  of alone: steps/s   fair   CPU")
     for count in sorted(found):
         speed, cpu = median(count, "steps_per_s"), median(count, "cpu_share")
@@ -59,7 +59,6 @@ def compare(
 @app.command()
 def one(steps: int) -> None:
     """One fit, as JSON on stdout."""
-    import numba
     import torch
 
     from mmsynth.field.warmup import warm_up
@@ -80,7 +79,7 @@ def one(steps: int) -> None:
     (began, cpu_began), (ended, cpu_ended) = times
     seconds, cpu = ended - began, cpu_ended - cpu_began
     facts = {"steps_per_s": steps / seconds, "cpu_per_step": cpu / steps, "cpu_share": cpu / seconds, "threads": torch.get_num_threads()}
-    print(json.dumps(facts | {"layer": numba.threading_layer()}))
+    print(json.dumps(facts))
 
 
 @contextmanager

@@ -8,13 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 import torch
 
 from mmsynth.bench import machine
 from mmsynth.errors import InputError
+from mmsynth.threads import kernel_threads
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,13 +31,13 @@ def test_a_machine_has_a_name_and_positive_limits() -> None:
 
 
 def test_threads_are_given_back() -> None:
-    before = torch.get_num_threads(), numba.get_num_threads()
+    before = torch.get_num_threads(), kernel_threads()
     with machine.use_threads(1):
-        assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
-    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+        assert (torch.get_num_threads(), kernel_threads()) == (1, 1)
+    assert (torch.get_num_threads(), kernel_threads()) == before
     with pytest.raises(InputError, match="--threads 99999"), machine.use_threads(99999):
         pass
-    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+    assert (torch.get_num_threads(), kernel_threads()) == before
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs Linux's /proc")

@@ -123,7 +123,7 @@ def test_pictures_are_the_same_to_the_bit_by_tiles_side_by_side(background: bool
     monkeypatch.setattr(fields, "TILE", 128)
     seen = []
     for threads in (1, 3, 3):
-        monkeypatch.setattr(tiles, "_threads", lambda threads=threads: threads)
+        monkeypatch.setattr(tiles, "kernel_threads", lambda threads=threads: threads)
         seen.append(field.render(camera, pose))
     for other in seen[1:]:
         for part in ("depth_z", "opacity", "normal", "valid"):

@@ -9,9 +9,8 @@ from __future__ import annotations
 import copy
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
-import numba
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -24,6 +23,7 @@ from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.surface import Surface
 from mmsynth.field.warmup import warm_up
+from mmsynth.threads import kernel_threads
 
 
 def assert_near(found: torch.Tensor, expected: torch.Tensor, tolerance: float, name: str) -> None:
@@ -154,7 +154,7 @@ def test_nothing_is_stored_where_no_gradient_can_be_asked_for(monkeypatch: pytes
     with torch.no_grad():
         surface(torch.zeros(5000, 3), 3)
         rendering.trace(surface, appearance, occupancy, origins, directions, jitter, SAMPLINGS["soft"])
-    assert slots == [numba.get_num_threads()] * 2
+    assert slots == [kernel_threads()] * 2
     rendering.trace(surface, appearance, occupancy, origins, directions, jitter, SAMPLINGS["soft"])
     assert slots[2:] == [-(-600 // CHUNK)]
 
@@ -383,22 +383,20 @@ def test_passes_do_not_share_what_they_keep() -> None:
 
 
 @pytest.fixture
-def threads() -> Iterator[range]:
-    before = numba.get_num_threads(), torch.get_num_threads()
-    yield range(1, numba.config.NUMBA_NUM_THREADS + 1)
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
+def torch_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
+@pytest.mark.usefixtures("torch_threads")
 @pytest.mark.parametrize("extent", [1.0, 2.0])
-def test_results_do_not_depend_on_the_number_of_threads(extent: float, threads: range) -> None:
-    if len(threads) < 2:
-        pytest.skip("numba may use one thread only")
+def test_results_do_not_depend_on_the_number_of_threads(extent: float, use_threads: Callable[[int], None]) -> None:
     parts, rays = _parts(extent, "own", 6), _rays(1500, 6)  # several chunks
     x = _positions(3000, parts[0].grid)
     results = []
-    for count in threads:
-        numba.set_num_threads(count)
+    for count in (1, 2, 5):
+        use_threads(count)
         torch.set_num_threads(count)
         result, hits = _quantities(parts, *rays, SAMPLINGS["soft"])
         result |= {"samples": hits.samples, "distance": parts[0](x, 3)}
@@ -425,20 +423,18 @@ def test_is_compiled_says_so() -> None:
 @pytest.mark.parametrize("extent", [1.0, 2.0])
 @pytest.mark.parametrize("share", [1.0, 1 / 16, 1 / 3])
 @pytest.mark.parametrize("grid", [3, 5, 32, 40])  # the last two: more than one task
-def test_cells_are_those_of_the_definition(extent: float, share: float, grid: int) -> None:
+def test_cells_are_those_of_the_definition(extent: float, share: float, grid: int, use_threads: Callable[[int], None]) -> None:
     """To the bit, while the surface moves, and by any number of threads."""
     surface, *_ = _parts(extent, "shell", 4)
     ours, theirs, alone = (Occupancy(grid, extent) for _ in range(3))
-    before = numba.get_num_threads()
     for step, sharpness in enumerate((20.0, 60.0, 400.0, 90.0)):
         with torch.no_grad():
             surface.grid.table.mul_(0.8)
         at = [torch.Generator().manual_seed(step) for _ in range(3)]
         open_ = theirs.update(lambda x: surface(x, 3), sharpness, at[0], share)
-        assert ours.update(surface.at(3), sharpness, at[1], share) == open_
-        numba.set_num_threads(1)
-        alone.update(surface.at(3), sharpness, at[2], share)
-        numba.set_num_threads(before)
+        for threads, cells, random in ((3, ours, at[1]), (1, alone, at[2])):
+            use_threads(threads)
+            assert cells.update(surface.at(3), sharpness, random, share) == open_
         assert torch.equal(ours.states, theirs.states) and torch.equal(alone.states, theirs.states)
     assert grid < 32 or len(ours.states.unique()) > 5
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -14,13 +15,14 @@ from torch import Tensor, nn
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import learning
-from mmsynth.field.kernels.cpu import steps, tasks
+from mmsynth.field.kernels.cpu import tasks
 from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.radiance import Shader
 from mmsynth.field.rendering import interval
 from mmsynth.field.surface import Surface
 from mmsynth.scene.scene import Sensor
+from mmsynth.threads import let_kernels_have
 
 SENSORS = {
     "rgb": Sensor("rgb", ("R", "G", "B"), (None,) * 3),
@@ -128,19 +130,14 @@ def test_a_step_is_that_of_the_definition(case: str) -> None:
     assert all(g.abs().max() > 0 for n, g in expected.items()), [n for n, g in expected.items() if not g.abs().max() > 0]
 
 
-def test_sums_do_not_depend_on_threads() -> None:
-    import numba
-
-    step = _step(*CASES["all"])
-    before, results = numba.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-            results.append(_run(step, torch.float32))
-    finally:
-        numba.set_num_threads(before)
-    assert results[0][0].loss == results[1][0].loss
-    assert all(torch.equal(g, results[1][1][n]) for n, g in results[0][1].items())
+def test_sums_do_not_depend_on_threads(use_threads: Callable[[int], None]) -> None:
+    step, results = _step(*CASES["all"]), []
+    for threads in (1, 2, 5):
+        use_threads(threads)
+        results.append(_run(step, torch.float32))
+    for learned, gradients in results[1:]:
+        assert learned.loss == results[0][0].loss
+        assert all(torch.equal(g, gradients[n]) for n, g in results[0][1].items())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -198,8 +195,8 @@ def _check_update(case: str, active: int) -> None:
 @pytest.mark.parametrize("threads", [1, 2, 4])
 @pytest.mark.parametrize("active", [1, 3])
 @pytest.mark.parametrize("case", ["all", "plain"])
-def test_a_step_of_adam_comes_with_it(case: str, active: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steps, "get_num_threads", lambda: threads)
+def test_a_step_of_adam_comes_with_it(case: str, active: int, threads: int, use_threads: Callable[[int], None]) -> None:
+    use_threads(threads)
     _check_update(case, active)
 
 
@@ -220,8 +217,8 @@ def test_nothing_moves_by_what_is_not_finite(what: str, dtype: torch.dtype, monk
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_what_fails_beside_the_kernels_is_raised(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steps, "get_num_threads", lambda: threads)
+def test_what_fails_beside_the_kernels_is_raised(threads: int, use_threads: Callable[[int], None]) -> None:
+    use_threads(threads)
     told, _ = _told(_step(*CASES["plain"]), torch.float32)
 
     def fails(*_: Any) -> Any:
@@ -246,6 +243,31 @@ def test_so_many_threads_take_tasks_at_once(threads: int) -> None:
     for _ in range(4):
         with pytest.raises(MemoryError, match="in one thread"):
             tasks.take_beside(lambda: None, threads, fails_in_the_last, (0,))
+
+
+def test_what_is_done_beside_a_kernel_may_call_kernels() -> None:
+    """The pool's only thread is the one that calls them: nobody waits for what it would have to begin."""
+    begun, at = threading.Event(), threading.current_thread
+
+    def call() -> tuple[threading.Thread, threading.Thread]:
+        begun.set()
+        return at(), tasks.take_beside(at, 2, lambda: None, ())
+
+    outer, inner = tasks.take_beside(call, 2, lambda: begun.wait(60), ())
+    assert outer is inner is not at()
+
+
+def test_kernels_that_several_threads_call_at_once_give_what_one_gives() -> None:
+    selection, _ = _selection(3, 0.5)
+    expected = kernels.draw(*_scene(), selection, [999, 333, 111], (4, 5))
+
+    def draw(_: int) -> bool:
+        let_kernels_have(2)
+        found = kernels.draw(*_scene(), selection, [999, 333, 111], (4, 5))
+        return torch.equal(found.tile, expected.tile) and torch.equal(found.directions, expected.directions)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(draw, range(40)))
 
 
 def test_far_light_is_what_a_ray_without_surface_shows() -> None:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -22,6 +22,7 @@ from mmsynth.field.kernels.cpu import stores
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.measurements import Batch
 from mmsynth.scene.scene import Sensor
+from mmsynth.threads import kernel_threads
 
 Modality = tuple[str, int, float, float]  # name, numbers per ray, level, saturation
 MOSAIC, FILM, TENSOR, ANALYSERS = (
@@ -252,7 +253,7 @@ def test_no_room_is_made_for_gradients_that_nobody_asks_for(monkeypatch: pytest.
     with torch.no_grad():
         _compare(case)
     _compare(case)
-    assert slots == [numba.get_num_threads(), -(-len(case.behind) // cpu_shading.CHUNK)]
+    assert slots == [kernel_threads(), -(-len(case.behind) // cpu_shading.CHUNK)]
 
 
 def test_losses_do_not_share_what_they_keep() -> None:
@@ -270,17 +271,12 @@ def test_losses_do_not_share_what_they_keep() -> None:
         assert all(p.grad is not None for p in case.shader.parameters())  # of _quantities, and no new one
 
 
-def test_results_do_not_depend_on_the_number_of_threads() -> None:
-    most = numba.config.NUMBA_NUM_THREADS
-    if most < 2:
-        pytest.skip("numba may use one thread only")
-    before, results = numba.get_num_threads(), []
-    case = _case(400)
+def test_results_do_not_depend_on_the_number_of_threads(use_threads: Callable[[int], None]) -> None:
+    case, results = _case(400), []
     assert len(case.features) > 4 * cpu_shading.CHUNK
-    for count in range(1, most + 1):
-        numba.set_num_threads(count)
+    for count in (1, 2, 5):
+        use_threads(count)
         results.append({name: value.clone() for name, value in _quantities(case).items()})
-    numba.set_num_threads(before)
     for other in results[1:]:
         for name, value in results[0].items():
             assert torch.equal(value, other[name]), name

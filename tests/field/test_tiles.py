@@ -6,18 +6,18 @@ import sys
 import threading
 from collections.abc import Iterator
 
-import numba
 import pytest
 import torch
 
 from mmsynth.field import tiles
 from mmsynth.field.kernels.cpu import stores
 from mmsynth.field.tiles import side_by_side
+from mmsynth.threads import kernel_threads
 
 
 @pytest.fixture
 def threads(monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(tiles, "_threads", lambda: 3)
+    monkeypatch.setattr(tiles, "kernel_threads", lambda: 3)
     return 3
 
 
@@ -37,16 +37,16 @@ def test_tiles_come_in_their_order_and_are_made_as_they_are_needed(threads: int)
 
 
 def test_each_has_a_thread_of_its_own_and_all_others_keep_theirs(threads: int) -> None:
-    before = torch.get_num_threads(), numba.get_num_threads()
+    before = torch.get_num_threads(), kernel_threads()
     meet = threading.Barrier(threads)  # no thread takes two tiles
 
     def look(_: int) -> tuple[int, int, int]:
         meet.wait(10)
-        return threading.get_ident(), torch.get_num_threads(), numba.get_num_threads()
+        return threading.get_ident(), torch.get_num_threads(), kernel_threads()
 
     seen = [found for _, found in side_by_side(look, range(threads))]
-    assert len({who for who, _, _ in seen}) == threads and {(of_torch, of_numba) for _, of_torch, of_numba in seen} == {(1, 1)}
-    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+    assert len({who for who, _, _ in seen}) == threads and {(of_torch, of_kernels) for _, of_torch, of_kernels in seen} == {(1, 1)}
+    assert (torch.get_num_threads(), kernel_threads()) == before
     later: list[int] = []
     thread = threading.Thread(target=lambda: later.append(torch.get_num_threads()))
     thread.start()
@@ -58,13 +58,6 @@ def test_fewer_tiles_than_threads_have_all_of_them_one_after_the_other(threads: 
     here = threading.get_ident()
     assert [found for _, found in side_by_side(lambda _: threading.get_ident(), range(threads - 1))] == [here] * (threads - 1)
     assert list(side_by_side(lambda tile: tile, [])) == []
-
-
-def test_numbas_last_resort_is_never_called_by_two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
-    for layer, expected in (("workqueue", 1), ("omp", 2), ("tbb", 2)):
-        monkeypatch.setattr(numba, "threading_layer", lambda layer=layer: layer)
-        assert tiles._threads() == expected
 
 
 def test_one_that_fails_ends_it_and_what_has_not_begun_is_not_worked_on(threads: int) -> None:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import copy
 import json
 import math
-import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import pytest
 import torch
@@ -220,45 +217,6 @@ def test_what_is_arranged_beside_the_step_before_is_what_the_step_needs(scene: S
     for name, value in beforehand.field.state_dict().items():
         assert torch.equal(value, theirs[name]), name
     assert beforehand.state == when_due.state
-
-
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread alone has none beside it")
-def test_no_parallel_kernel_is_started_beside_the_kernels_of_a_step(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would have threads of its own, or end the process, where numba has no threads that two may ask."""
-    called: dict[str, set[str]] = {}
-
-    def recorded(kernel: Any, name: str) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            called.setdefault(name, set()).add(threading.current_thread().name)
-            return kernel(*arguments)
-
-        return call
-
-    for module in (m for n, m in sys.modules.items() if n.startswith("mmsynth.field.kernels.cpu.")):
-        for name, kernel in list(vars(module).items()):
-            if getattr(kernel, "targetoptions", {}).get("parallel"):
-                monkeypatch.setattr(module, name, recorded(kernel, name))
-    beside = set()
-    trainer = _trainer(scene, 40, **{"radiance.view_dependence": "auto", "schedule.view_dependence_from": 0.1})
-    learn = kernels.learn
-
-    def learn_and_tell(arranged: Any, update: Any, meanwhile: Any) -> Any:
-        def tell(learned: kernels.Learned) -> None:
-            beside.add(threading.current_thread().name)
-            meanwhile(learned)
-
-        return learn(arranged, update, tell)
-
-    monkeypatch.setattr(kernels, "learn", learn_and_tell)
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(2)
-        while trainer.progress < 1.0:
-            trainer.run_step()
-    finally:
-        numba.set_num_threads(before)
-    assert "classify" in called and threading.main_thread().name not in beside  # so what is called, and where, is recorded
-    assert {name for name, threads in called.items() if threads - {threading.main_thread().name}} == set()
 
 
 @pytest.mark.usefixtures("decided_by_few_rays")

@@ -5,15 +5,15 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import prange
 
 from mmsynth.field.kernels.constants import DRAW_JITTER, DRAW_PIXEL, DRAW_TILE, PURPOSE_STRIDE, WORD
+from mmsynth.field.kernels.cpu.arrays import as_arrays, as_compiled
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
+from mmsynth.field.kernels.cpu.tasks import take, take_all
 from mmsynth.field.kernels.parameters import Cameras, Drawing, Drawn, Frames, Measured, Modalities, Selection
 
 CHUNK = 64  # rays
@@ -112,28 +112,20 @@ def _in_camera(cameras, camera, row, column):  # type: ignore[no-untyped-def]
     return x / length, y / length, z / length
 
 
-# parts of a drawing: its tables, rays (N,) and key (2,), the first seven of ``Drawn``, ``Measured``
-_ENDS = tuple(accumulate(len(kind._fields) for kind in (Frames, Cameras, Modalities, Selection)))
-_CAMERAS, _MODALITIES, _SELECTION, _RAYS = _ENDS
-_KEY, _DRAWN, _MEASURED = _RAYS + 1, _RAYS + 2, _RAYS + 9
-
-
 @part()
-def drawing_tasks(drawing):  # type: ignore[no-untyped-def]
+def drawing_tasks(to_fill):  # type: ignore[no-untyped-def]
     """How many there are."""
-    return (np.int64(drawing[_DRAWN].shape[0]) + CHUNK - 1) // CHUNK
+    return (to_fill.drawn.jitter.shape[0] + CHUNK - 1) // CHUNK
 
 
 @part()
-def draw_chunk(chunk, drawing):  # type: ignore[no-untyped-def]
-    """A task: some of the rays. drawing: the arrays of a ``ToFill``."""
-    frames, cameras = Frames(*drawing[:_CAMERAS]), Cameras(*drawing[_CAMERAS:_MODALITIES])
-    modalities, selection = Modalities(*drawing[_MODALITIES:_SELECTION]), Selection(*drawing[_SELECTION:_RAYS])
-    rays, key = drawing[_RAYS], drawing[_KEY]
+def draw_chunk(chunk, to_fill):  # type: ignore[no-untyped-def]
+    """A task: some of the rays."""
+    frames, cameras, modalities, selection, rays, key = to_fill.drawing
     n_modalities, n_drawn = rays.shape[0], np.count_nonzero(rays)
     rays_end, numbers_end = np.cumsum(rays), np.cumsum(rays * modalities.values)
-    out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame = drawing[_DRAWN:_MEASURED]
-    target, of_ray, output, axes, level, saturation, weight = drawing[_MEASURED:]
+    out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame, measured = to_fill.drawn
+    target, of_ray, output, axes, level, saturation, weight = measured
     axes_begin = target.shape[0] - axes.shape[0]
     for ray in range(chunk * CHUNK, min(out_jitter.shape[0], (chunk + 1) * CHUNK)):
         n = _first_above(rays_end, 0, n_modalities - 1, ray)
@@ -206,11 +198,13 @@ def draw_chunk(chunk, drawing):  # type: ignore[no-untyped-def]
                 output[number] += channel
 
 
-@kernel(parallel=True)
-def draw_rays(drawing):  # type: ignore[no-untyped-def]
+@kernel()
+def draw_rays(next_task, to_fill):  # type: ignore[no-untyped-def]
     """Fills what is drawn."""
-    for chunk in prange(drawing_tasks(drawing)):
-        draw_chunk(np.int64(chunk), drawing)
+    chunk = take(next_task, 0)
+    while chunk < drawing_tasks(to_fill):
+        draw_chunk(chunk, to_fill)
+        chunk = take(next_task, 0)
 
 
 @kernel()
@@ -240,45 +234,46 @@ def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignor
 
 
 class ToFill(NamedTuple):
-    """A drawing as kernels take it, all arrays in one tuple (numba's parallel kernels take none of tuples), and what they fill."""
+    """What kernels take: a ``Drawing`` and the ``Drawn`` that they fill, of arrays, rays (N,) and key (2,) among them."""
 
-    arrays: tuple[np.ndarray, ...]
-    drawn: Drawn
+    drawing: Any
+    drawn: Any
 
 
-def to_fill(drawing: Drawing) -> ToFill:
-    """With room for what is drawn."""
+def room_for(drawing: Drawing) -> tuple[ToFill, Drawn]:
+    """For what is drawn, and the same as tensors."""
     *tables, rays, key = drawing
     modalities = drawing.modalities
     values = modalities.values.tolist()
     count, numbers = sum(rays), sum(r * k for r, k in zip(rays, values, strict=True))
     polarized = sum(r * k for r, k, a in zip(rays, values, modalities.analyser_first.tolist(), strict=True) if a >= 0)
     single, whole = torch.empty, lambda length: torch.empty(length, dtype=torch.int64)
-    drawn = single(count, 3), single(count, 3), single(count), single(count), single(count), whole(count), whole(numbers)
     measured = Measured(
         single(numbers), whole(numbers), whole(numbers), single(polarized, 3), single(numbers), single(numbers), single(numbers)
     )
-    told, filled = (x.numpy() for table in tables for x in table), (x.numpy() for x in (*drawn, *measured))
-    return ToFill((*told, np.array(rays, np.int64), np.array(key, np.int64), *filled), Drawn(*drawn, measured))
+    drawn = Drawn(single(count, 3), single(count, 3), single(count), single(count), single(count), whole(count), whole(numbers), measured)
+    told: list[Any] = [*map(as_arrays, tables), np.array(rays, np.int64), np.array(key, np.int64)]
+    filled: list[Any] = [*map(as_compiled, drawn[:-1]), as_arrays(measured)]
+    return ToFill(Drawing(*told), Drawn(*filled)), drawn
 
 
 @functools.cache
-def nothing_to_draw() -> tuple[np.ndarray, ...]:
+def nothing_to_draw() -> ToFill:
     """Of no frame."""
     long, whole, single = (torch.empty(0, dtype=kind) for kind in (torch.int64, torch.int32, torch.float32))
     stored = whole.view(torch.uint8), whole.view(torch.uint16), single
     frames = Frames(long, whole, whole, whole, whole, single.view(0, 3, 3), single.view(0, 3), *stored)
     cameras, selection = Cameras(whole, whole, long, whole, whole, single.view(0, 3)), Selection(long, single, whole, long, whole)
     modalities = Modalities(*(whole,) * 10, single, single, single, whole, single.view(0, 2))  # type: ignore[call-arg]
-    return to_fill(Drawing(frames, cameras, modalities, selection, [], (0, 0))).arrays
+    return room_for(Drawing(frames, cameras, modalities, selection, [], (0, 0)))[0]
 
 
 def draw(
     frames: Frames, cameras: Cameras, modalities: Modalities, selection: Selection, rays: Sequence[int], key: tuple[int, int]
 ) -> Drawn:
     """See ``drawing.draw``; float32."""
-    arrays, drawn = to_fill(Drawing(frames, cameras, modalities, selection, rays, key))
-    draw_rays(arrays)
+    to_fill, drawn = room_for(Drawing(frames, cameras, modalities, selection, rays, key))
+    take_all(-(-len(drawn.jitter) // CHUNK), draw_rays, to_fill)
     return drawn
 
 

@@ -182,7 +182,7 @@ def learn_rays(  # type: ignore[no-untyped-def]
 
     next_task: (2,), the second number counts threads, each of which has a slot of its own in the stores.
     surface, layers, light: ``SurfaceLayers``, and ``Layers`` of the shader and of the light's network, with the columns of the lamps that
-    there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: the arrays of a ``ToFill``.
+    there are. lamps: those. gain, mirrored: (M,), empty where there are none. ahead, ahead_too: ``ToFill``.
     """
     worker, total, points = take(next_task, 1), rays.origins.shape[0], eikonal.points.shape[0]
     chunks = (total + CHUNK - 1) // CHUNK

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import get_thread_id, prange
 
 from mmsynth.field.kernels.constants import (
     ALONG_FACE,
@@ -35,6 +34,7 @@ from mmsynth.field.kernels.constants import (
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
+from mmsynth.field.kernels.cpu.tasks import take
 
 CHUNK = 128  # rays
 LANES = 64
@@ -319,15 +319,18 @@ def composite(begin, count, slot, sections, appearance, store, features, distanc
                 features[which, begin + i, j] *= scale
 
 
-@kernel(parallel=True)
-def trace_forward(rays, states, sampling, grid, layers, appearance, keep, store, out):  # type: ignore[no-untyped-def]
+@kernel()
+def trace_forward(next_task, rays, states, sampling, grid, layers, appearance, keep, store, out):  # type: ignore[no-untyped-def]
     """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
-    total, samples = rays.origins.shape[0], out.samples  # in a parallel loop, numba would not set a tuple's arrays
-    for chunk in prange((total + CHUNK - 1) // CHUNK):
-        slot = np.int64(chunk) if keep else np.int64(get_thread_id())
-        begin = np.int64(chunk) * CHUNK
+    total, slot = rays.origins.shape[0], take(next_task, 1)
+    chunk = take(next_task, 0)
+    while chunk * CHUNK < total:
+        if keep:
+            slot = chunk
+        begin = chunk * CHUNK
         count = min(CHUNK, total - begin)
-        samples[chunk] = march_rays(begin, count, slot, rays, states, sampling, grid, layers, store)
+        out.samples[chunk] = march_rays(begin, count, slot, rays, states, sampling, grid, layers, store)
         contracted = grid.extent > np.float32(1.0)
         sections = find_sections(begin, count, slot, rays, contracted, sampling, store, out.weight, out.depth)
         composite(begin, count, slot, sections, appearance, store, out.features, out.distance, out.shown)
+        chunk = take(next_task, 0)

@@ -10,12 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from mmsynth.field.kernels.constants import LEAST_ROUGHNESS, REFRACTIVE_INDEX
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import softplus
 from mmsynth.field.kernels.cpu.shading import first_at
+from mmsynth.field.kernels.cpu.tasks import take
 
 CHUNK = 64  # rays
 _f = np.float32
@@ -133,13 +133,14 @@ def _reflect_rows(begin, end, lamps, mirrors, amount, axis, degree):  # type: ig
             degree[row, k] = terms[20] * gate[i, 4]
 
 
-@kernel(parallel=True)
-def reflect(lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
+@kernel()
+def reflect(next_task, lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
     """See ``mirroring.reflect``."""
     surfaces = mirrors.points.shape[0]
-    for task in prange((surfaces + CHUNK - 1) // CHUNK):
-        begin = np.int64(task) * CHUNK
+    begin = take(next_task, 0) * CHUNK
+    while begin < surfaces:
         _reflect_rows(begin, min(begin + CHUNK, surfaces), lamps, mirrors, amount, axis, degree)
+        begin = take(next_task, 0) * CHUNK
 
 
 @inlined()
@@ -186,13 +187,14 @@ def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # typ
                     out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
 
 
-@kernel(parallel=True)
-def mirror(lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
+@kernel()
+def mirror(next_task, lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.mirror``; ``measured.ray`` never decreases."""
     rays = behind.shape[0]
-    for task in prange((rays + CHUNK - 1) // CHUNK):
-        begin = np.int64(task) * CHUNK
+    begin = take(next_task, 0) * CHUNK
+    while begin < rays:
         mirror_rays(begin, min(begin + CHUNK, rays), np.int64(0), lamps, mirrors, behind, measured, out)
+        begin = take(next_task, 0) * CHUNK
 
 
 @part()
@@ -298,12 +300,13 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
             g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate[place, 0] * (_ONE - gate[place, 0])
 
 
-@kernel(parallel=True)
-def mirror_backward(lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
+@kernel()
+def mirror_backward(next_task, lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """g: (M,) gradients of the numbers; out: ``Gradients``."""
-    rays, g_position, g_spectrum = behind.shape[0], out.position, out.spectrum
-    for task in prange((rays + CHUNK - 1) // CHUNK):
-        chunk = np.int64(task)
+    rays = behind.shape[0]
+    chunk = take(next_task, 0)
+    while chunk * CHUNK < rays:
         begin = chunk * CHUNK
-        g_position[chunk], g_spectrum[chunk] = _ZERO, _ZERO
+        out.position[chunk], out.spectrum[chunk] = _ZERO, _ZERO
         mirror_rays_backward(begin, min(begin + CHUNK, rays), np.int64(0), chunk, lamps, mirrors, behind, measured, g, out)
+        chunk = take(next_task, 0)

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import get_num_threads
 from torch import Tensor
 
 from mmsynth.field.kernels import reference
@@ -28,6 +27,7 @@ from mmsynth.field.kernels.cpu.stores import (
     surface_store,
 )
 from mmsynth.field.kernels.cpu.surface import POINTS
+from mmsynth.field.kernels.cpu.tasks import take_all
 from mmsynth.field.kernels.learning import gradient_of
 from mmsynth.field.kernels.mirroring import Reflection
 from mmsynth.field.kernels.parameters import (
@@ -43,6 +43,7 @@ from mmsynth.field.kernels.parameters import (
     ShaderWeights,
     SurfaceNetwork,
 )
+from mmsynth.threads import kernel_threads
 
 
 class TraceOutputs(NamedTuple):
@@ -80,9 +81,10 @@ class _Value(torch.autograd.Function):
     def forward(
         ctx: Any, keep: bool, positions: Tensor, grid: GridTable, network: SurfaceNetwork, hidden: Tensor, output: Tensor
     ) -> Tensor:
-        store = surface_store(-(-len(positions) // POINTS) if keep else get_num_threads(), len(hidden), len(grid.resolutions))
-        out = torch.empty(len(positions))
-        surface.surface_forward(as_array(positions), as_arrays(grid), surface_layers(as_arrays(network)), keep, store.arrays, out.numpy())
+        chunks = -(-len(positions) // POINTS)
+        store = surface_store(chunks if keep else kernel_threads(), len(hidden), len(grid.resolutions))
+        out, weights = torch.empty(len(positions)), surface_layers(as_arrays(network))
+        take_all(chunks, surface.surface_forward, as_array(positions), as_arrays(grid), weights, keep, store.arrays, out.numpy())
         if keep:
             ctx.store, ctx.parameters = store, (grid, network)
             ctx.save_for_backward(hidden, output)
@@ -93,25 +95,26 @@ class _Value(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         hidden, output = ctx.saved_tensors
         (grid, network), arrays, count = ctx.parameters, ctx.store.arrays, len(gradient)
+        chunks = -(-count // POINTS)
         g, table, weights = as_array(gradient), as_arrays(grid), surface_layers(as_arrays(network._replace(hidden=hidden, output=output)))
-        surface.surface_backward(g, grid.active, weights, arrays)
+        take_all(chunks, surface.surface_backward, g, grid.active, weights, arrays)
         positions = None
         if ctx.needs_input_grad[1]:
             positions = torch.empty(count, 3)
-            surface.surface_positions(g, table, weights, arrays, positions.numpy())
+            take_all(chunks, surface.surface_positions, g, table, weights, arrays, positions.numpy())
         if grid.table.requires_grad:
-            surface.surface_scatter(count, table, arrays, gradient_of(grid.table).numpy())
+            take_all(grid.active, surface.surface_scatter, count, table, arrays, gradient_of(grid.table).numpy())
         ctx.store = None
-        return None, positions, None, None, *_summed(arrays, -(-count // POINTS), hidden)
+        return None, positions, None, None, *_summed(arrays, chunks, hidden)
 
 
 def classify(states: Tensor, cells: Cells, grid: GridTable, network: SurfaceNetwork) -> None:
     """See ``reference.classify``, of a surface; float32."""
-    threads, side = get_num_threads(), states.shape[0]
-    store = surface_store(threads, len(network.hidden), len(grid.resolutions))
+    side = states.shape[0]
+    store = surface_store(kernel_threads(), len(network.hidden), len(grid.resolutions))
     centre = ((torch.arange(side) + 0.5) * (2.0 / side) - 1.0) * cells.extent
-    surface.classify(
-        threads, np.zeros(2, np.int64), states.view(-1).numpy(), centre.numpy(), as_arrays(cells), as_arrays(grid),
+    take_all(
+        -(-states.numel() // surface.CELLS), surface.classify, states.view(-1).numpy(), centre.numpy(), as_arrays(cells), as_arrays(grid),
         surface_layers(as_arrays(network)), store.arrays,
     )  # fmt: skip
 
@@ -138,13 +141,13 @@ class _Trace(torch.autograd.Function):
         grid, network, appearance, states, rays, sampling = parameters
         count, levels = len(origins), len(appearance.resolutions)
         chunks = -(-count // CHUNK)
-        store = ray_store(chunks if keep else get_num_threads(), len(hidden), len(grid.resolutions), levels)
+        store = ray_store(chunks if keep else kernel_threads(), len(hidden), len(grid.resolutions), levels)
         features = torch.empty(2, count, FEATURES * levels)
         weight, distance, shown, depth = torch.empty(2, count), torch.empty(2, count), torch.empty(2, count), torch.empty(count)
         samples = torch.zeros(max(chunks, 1), dtype=torch.int64)
-        marching.trace_forward(
-            as_arrays(rays), as_array(states), sampling, as_arrays(grid), surface_layers(as_arrays(network)), as_arrays(appearance), keep,
-            store.arrays,
+        take_all(
+            chunks, marching.trace_forward, as_arrays(rays), as_array(states), sampling, as_arrays(grid),
+            surface_layers(as_arrays(network)), as_arrays(appearance), keep, store.arrays,
             TraceOutputs(*(x.numpy() for x in (features, weight, distance, shown, depth, samples))),
         )  # fmt: skip
         behind = torch.full((count,), -1)
@@ -162,23 +165,25 @@ class _Trace(torch.autograd.Function):
     def backward(ctx: Any, g_features: Tensor, g_weight: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         hidden, output, origins, directions, features, shown, behind = ctx.saved_tensors
         (grid, network, appearance, sharpness), arrays, count = ctx.parameters, ctx.store.arrays, len(origins)
-        table, look = as_arrays(grid), as_arrays(appearance)
+        table, look, chunks = as_arrays(grid), as_arrays(appearance), -(-count // CHUNK)
         weights = surface_layers(as_arrays(network._replace(hidden=hidden, output=output)))
-        tracing_gradients.trace_backward(
-            *map(as_array, (behind, g_features, g_weight, features, shown)), sharpness, grid.active, weights, appearance.active, arrays
-        )
+        take_all(
+            chunks, tracing_gradients.trace_backward, *map(as_array, (behind, g_features, g_weight, features, shown)), sharpness,
+            grid.active, weights, appearance.active, arrays,
+        )  # fmt: skip
         to_rays: list[Tensor | None] = [None, None]
         if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
             found = torch.empty(origins.shape), torch.empty(directions.shape)
-            tracing_gradients.trace_rays_backward(
-                as_array(origins), as_array(directions), table, weights, look, arrays, *(x.numpy() for x in found)
-            )
+            take_all(
+                chunks, tracing_gradients.trace_rays_backward, as_array(origins), as_array(directions), table, weights, look, arrays,
+                *(x.numpy() for x in found),
+            )  # fmt: skip
             to_rays = list(found)
         if grid.table.requires_grad or appearance.table.requires_grad:
             gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
-            tracing_gradients.trace_scatter(count, table, look, arrays, *gradients)
+            take_all(grid.active + appearance.active, tracing_gradients.trace_scatter, count, table, look, arrays, *gradients)
         ctx.store = None
-        return None, *to_rays, *_summed(arrays, -(-count // CHUNK), hidden), None
+        return None, *to_rays, *_summed(arrays, chunks, hidden), None
 
 
 def compare(
@@ -209,12 +214,12 @@ class _Compare(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         chunks = -(-len(rays.behind) // shading.CHUNK)
         tensors = ShaderWeights(*weights)
-        arrays = (store := shading_store(max(chunks, get_num_threads()) if learn else get_num_threads(), tensors)).arrays
+        arrays = (store := shading_store(max(chunks if learn else 0, kernel_threads()), tensors)).arrays
         loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
         gradients = [torch.empty(x.shape) for x in (features, share, gain, mirrored)]
-        shading.compare(
-            as_arrays(rays), as_arrays(measured), as_array(gain), as_array(mirrored), *shader_layers(as_arrays(tensors)), learn, arrays,
-            loss, squared.numpy(), *(g.numpy() for g in gradients),
+        take_all(
+            chunks, shading.compare, as_arrays(rays), as_arrays(measured), as_array(gain), as_array(mirrored),
+            *shader_layers(as_arrays(tensors)), learn, arrays, loss, squared.numpy(), *(g.numpy() for g in gradients),
         )  # fmt: skip
         if learn:
             for name, weight in zip(ShaderWeights._fields, weights, strict=True):
@@ -235,8 +240,8 @@ def shade(weights: ShaderWeights, features: Tensor, directions: Tensor, degrees:
     """See ``reference.shade``; fused for rays of one degree, without a gradient."""
     if isinstance(degrees, Tensor) or torch.is_grad_enabled():
         return reference.shade(weights, features, directions, degrees)
-    outputs = torch.empty(len(features), len(weights.heads_bias))
-    shading.shade(as_array(features), as_array(directions), degrees, *shader_layers(as_arrays(weights)), outputs.numpy())
+    outputs, layers = torch.empty(len(features), len(weights.heads_bias)), shader_layers(as_arrays(weights))
+    take_all(-(-len(features) // shading.CHUNK), shading.shade, as_array(features), as_array(directions), degrees, *layers, outputs.numpy())
     return outputs
 
 
@@ -246,7 +251,8 @@ def reflect(position: Tensor, mirrors: Mirrors) -> Reflection:
         return reference.reflect(position, mirrors)
     surfaces, count = len(mirrors.points), len(position)
     found = Reflection(torch.empty(surfaces, count), torch.empty(surfaces, count, 3), torch.empty(surfaces, count))
-    mirroring.reflect(as_arrays(Lamps(position, torch.empty(count, 0))), as_arrays(mirrors), *(x.numpy() for x in found))
+    lamps = as_arrays(Lamps(position, torch.empty(count, 0)))
+    take_all(-(-surfaces // mirroring.CHUNK), mirroring.reflect, lamps, as_arrays(mirrors), *(x.numpy() for x in found))
     return found
 
 
@@ -262,8 +268,11 @@ class _Mirror(torch.autograd.Function):
     def forward(ctx: Any, behind: Tensor, measured: Measured, mirrors: Mirrors, *differentiable: Tensor) -> Tensor:
         position, spectrum, material, normals, share = differentiable
         out = torch.empty(len(measured.ray))
-        mirrors = mirrors._replace(material=material, normals=normals, share=share)
-        mirroring.mirror(as_arrays(Lamps(position, spectrum)), as_arrays(mirrors), as_array(behind), as_arrays(measured), out.numpy())
+        lamps, mirrors = Lamps(position, spectrum), mirrors._replace(material=material, normals=normals, share=share)
+        take_all(
+            -(-len(behind) // mirroring.CHUNK), mirroring.mirror, as_arrays(lamps), as_arrays(mirrors), as_array(behind),
+            as_arrays(measured), out.numpy(),
+        )  # fmt: skip
         ctx.constants = behind, measured, mirrors.points, mirrors.directions
         ctx.save_for_backward(*differentiable)
         return out
@@ -276,8 +285,8 @@ class _Mirror(torch.autograd.Function):
         of_rows = [torch.empty(x.shape) for x in (material, normals, share)]
         of_lamps = [torch.empty(chunks, *x.shape) for x in (position, spectrum)]
         mirrors = Mirrors(material, normals, points, directions, share)
-        mirroring.mirror_backward(
-            as_arrays(Lamps(position, spectrum)), as_arrays(mirrors), as_array(behind), as_arrays(measured), as_array(gradient),
-            mirroring.Gradients(*(x.numpy() for x in (*of_rows, *of_lamps))),
+        take_all(
+            chunks, mirroring.mirror_backward, as_arrays(Lamps(position, spectrum)), as_arrays(mirrors), as_array(behind),
+            as_arrays(measured), as_array(gradient), mirroring.Gradients(*(x.numpy() for x in (*of_rows, *of_lamps))),
         )  # fmt: skip
         return None, None, None, *(x.sum(0) for x in of_lamps), *of_rows

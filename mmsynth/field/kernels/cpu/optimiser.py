@@ -7,14 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numba import prange, types
+from numba import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 from torch import Tensor
 
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu.jit import kernel, part
-from mmsynth.field.kernels.cpu.tasks import take, wait
+from mmsynth.field.kernels.cpu.tasks import take, take_all, wait
 from mmsynth.field.kernels.parameters import AdamPart, AdamStep
 
 ADAM_CHUNK = 16384  # parameters at a time
@@ -77,12 +77,14 @@ def take_parts(next_task, task, others, done, places, numbers):  # type: ignore[
         task = take(next_task, 0) - others
 
 
-@kernel(parallel=True)
-def adam_tensor(p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
+@kernel()
+def adam_tensor(next_task, p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
     """``adam_part`` of a whole tensor (N,)."""
-    for task in prange((len(p) + ADAM_CHUNK - 1) // ADAM_CHUNK):
-        some = slice(task * ADAM_CHUNK, (task + 1) * ADAM_CHUNK)
+    begin = take(next_task, 0) * ADAM_CHUNK
+    while begin < len(p):
+        some = slice(begin, begin + ADAM_CHUNK)
         adam_part(p[some], g[some], m[some], v[some], rate, beta1, beta2, root, epsilon, sparse)
+        begin = take(next_task, 0) * ADAM_CHUNK
 
 
 def _numbers(step: AdamStep) -> tuple[float, ...]:
@@ -112,5 +114,6 @@ def places_and_numbers(parts: Sequence[AdamPart], levels: Mapping[int, tuple[np.
 
 def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: AdamStep) -> None:
     """See ``reference.adam``; float32."""
-    rate, *others = (np.float32(x) for x in _numbers(step))
-    adam_tensor(*(x.detach().view(-1).numpy() for x in (parameter, gradient, first, second)), rate, *others, step.sparse)
+    tensors, numbers = (parameter, gradient, first, second), (np.float32(x) for x in _numbers(step))
+    flat = (x.detach().view(-1).numpy() for x in tensors)
+    take_all(-(-parameter.numel() // ADAM_CHUNK), adam_tensor, *flat, *numbers, step.sparse)

@@ -13,11 +13,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_thread_id, prange
 
 from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
+from mmsynth.field.kernels.cpu.tasks import take
 
 CHUNK = 64  # rays
 _HUBER = np.float32(HUBER_DELTA)
@@ -264,18 +264,19 @@ def compare_rays(  # type: ignore[no-untyped-def]
     return loss
 
 
-@kernel(parallel=True)
+@kernel()
 def compare(  # type: ignore[no-untyped-def]
-    rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, loss, squared, g_features, g_share, g_gain, g_mirrored
-):
+    next_task, rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, loss, squared, g_features, g_share, g_gain,
+    g_mirrored,
+):  # fmt: skip
     """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` and ``mirrored`` may be empty; the loss and, where
     ``learn``, the gradients of weights are per chunk.
 
     store: ``ShadingStore``, whose scratch has a slot per thread, and its gradients where there are none.
     """
-    total = len(rays.behind)
-    for task in prange((total + CHUNK - 1) // CHUNK):
-        chunk, slot = np.int64(task), np.int64(get_thread_id())
+    total, slot = len(rays.behind), take(next_task, 1)
+    chunk = take(next_task, 0)
+    while chunk * CHUNK < total:
         begin = chunk * CHUNK
         of_weights = chunk if learn else slot
         clear_gradients(store, of_weights)
@@ -283,6 +284,7 @@ def compare(  # type: ignore[no-untyped-def]
             begin, min(CHUNK, total - begin), np.int64(0), slot, of_weights, rays, measured, gain, mirrored, layers, heads, heads_bias,
             learn, store, squared, g_features, g_share, g_gain, g_mirrored,
         )  # fmt: skip
+        chunk = take(next_task, 0)
 
 
 @part()
@@ -306,10 +308,11 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
             outputs[begin + i, k] = out[i, k] + heads_bias[k]
 
 
-@kernel(parallel=True)
-def shade(features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
+@kernel()
+def shade(next_task, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """See ``reference.shade``, of rays that all have one degree."""
     rays, turned = len(features), padded(heads.T)
-    for task in prange((rays + CHUNK - 1) // CHUNK):
-        begin = np.int64(task) * CHUNK
+    begin = take(next_task, 0) * CHUNK
+    while begin < rays:
         _shade_chunk(begin, min(CHUNK, rays - begin), features, directions, degree, layers, turned, heads_bias, outputs)
+        begin = take(next_task, 0) * CHUNK

@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import get_num_threads
 
 from mmsynth.field.kernels.constants import FEATURES
 from mmsynth.field.kernels.cpu import learning, slopes
 from mmsynth.field.kernels.cpu.arrays import as_arrays, as_compiled, in_double, shader_layers
 from mmsynth.field.kernels.cpu.blocks import surface_layers
-from mmsynth.field.kernels.cpu.drawing import ToFill, nothing_to_draw, to_fill
+from mmsynth.field.kernels.cpu.drawing import ToFill, nothing_to_draw, room_for
 from mmsynth.field.kernels.cpu.learning import WeightGradients
 from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.mirrors import lamps_and_layers
@@ -21,14 +20,15 @@ from mmsynth.field.kernels.cpu.optimiser import places_and_numbers
 from mmsynth.field.kernels.cpu.stores import chunk_scratch, light_out, ray_store, shading_store, table_store, tap_store
 from mmsynth.field.kernels.cpu.tasks import take_beside
 from mmsynth.field.kernels.learning import gradient_of, no_light
-from mmsynth.field.kernels.parameters import AdamPart, Arranged, Drawing, Learned, Step
+from mmsynth.field.kernels.parameters import AdamPart, Arranged, Drawing, Drawn, Learned, Step
+from mmsynth.threads import kernel_threads
 
 
 class _Made(NamedTuple):
     """Of ``Arranged``: the step with arrays in the place of tensors, and what is drawn beside it."""
 
     step: Any
-    ahead: tuple[ToFill, ...]
+    ahead: tuple[tuple[ToFill, Drawn], ...]
 
 
 @torch.no_grad()
@@ -36,7 +36,7 @@ def arrange(step: Step, ahead: Sequence[Drawing] = ()) -> Arranged:
     """See ``kernels.arrange``."""
     arrays: list[Any] = [as_arrays(x) if isinstance(x, tuple) else as_compiled(x) for x in step]
     of_step = Step(*arrays)._replace(sampling=in_double(step.sampling))
-    return Arranged(step, tuple(ahead), _Made(of_step, tuple(to_fill(drawing) for drawing in ahead)))
+    return Arranged(step, tuple(ahead), _Made(of_step, tuple(room_for(drawing) for drawing in ahead)))
 
 
 @torch.no_grad()
@@ -49,7 +49,7 @@ def learn(
     step, (made, ahead) = arranged.step, arranged.made
     table, network, look, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = made
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
-    chunks, threads = -(-count // CHUNK), get_num_threads()
+    chunks, threads = -(-count // CHUNK), kernel_threads()
     tasks = chunks + -(-points // slopes.POINTS)
     units, levels = len(network.hidden), len(table.resolutions)
     features, hidden, used = FEATURES * len(look.resolutions), len(light.first), light.used
@@ -65,7 +65,7 @@ def learn(
     out = light_out(tasks, features, len(columns), hidden, len(used), len(shader.heads_bias))
     squared, mirrored = np.empty(numbers, np.float32), np.empty(numbers if len(used) else 0, np.float32)
     g_mirrored, g_gain, samples = np.empty_like(mirrored), np.empty_like(gain), np.zeros(max(chunks, 1), np.int64)
-    first, second = (*(x.arrays for x in ahead), nothing_to_draw(), nothing_to_draw())[:2]
+    first, second = (*(to_fill for to_fill, _ in ahead), nothing_to_draw(), nothing_to_draw())[:2]
     to_learn = (
         np.zeros(2, np.int64), rays, states, sampling, table, surface_layers(network), look, *shader_layers(shader), shining, lamps,
         far_light, view, measured, gain, opacities, eikonal, first, second, store.arrays, kept.arrays, taps.arrays, weights.arrays,
@@ -96,7 +96,7 @@ def learn(
 
     def to_tell() -> Learned:
         found = (torch.from_numpy(np.array(x, kind)) for x, kind in ((loss, np.float32), (samples.sum(), np.int64)))
-        result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(x.drawn for x in ahead))
+        result = Learned(next(found), torch.from_numpy(sums)[1], torch.from_numpy(squared), next(found), tuple(drawn for _, drawn in ahead))
         if meanwhile is not None:
             meanwhile(result)
         return result

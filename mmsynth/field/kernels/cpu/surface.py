@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import get_thread_id, prange
 
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.cpu.blocks import (
@@ -16,18 +15,20 @@ from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.tasks import take
 
 POINTS = 128  # positions of a block
-_CELLS = 8192  # of a task
+CELLS = 8192  # of a task of ``classify``
 _f = np.float32
 _ZERO, _ONE, _MOST = _f(0.0), _f(1.0), _f(253 - OUTSIDE)
 
 
-@kernel(parallel=True)
-def surface_forward(positions, grid, layers, keep, store, out):  # type: ignore[no-untyped-def]
+@kernel()
+def surface_forward(next_task, positions, grid, layers, keep, store, out):  # type: ignore[no-untyped-def]
     """Signed distance of (N, 3) positions; store: see ``SurfaceStore``, a slot per block when ``keep``, else per thread."""
-    count = positions.shape[0]
-    for chunk in prange((count + POINTS - 1) // POINTS):
-        slot = np.int64(chunk) if keep else np.int64(get_thread_id())
-        begin = np.int64(chunk) * POINTS
+    count, slot = positions.shape[0], take(next_task, 1)
+    chunk = take(next_task, 0)
+    while chunk * POINTS < count:
+        if keep:
+            slot = chunk
+        begin = chunk * POINTS
         n = min(POINTS, count - begin)
         b = store.block[slot]
         for i in range(n):
@@ -35,41 +36,46 @@ def surface_forward(positions, grid, layers, keep, store, out):  # type: ignore[
                 b[i, a] = positions[begin + i, a]
             b[i, 3] = np.float32(1.0)
         surface_block(b, store.hidden[slot], out[begin : begin + n], n, grid, layers)
+        chunk = take(next_task, 0)
 
 
-@kernel(parallel=True)
-def surface_backward(gradient, active, layers, store):  # type: ignore[no-untyped-def]
+@kernel()
+def surface_backward(next_task, gradient, active, layers, store):  # type: ignore[no-untyped-def]
     """Gradients of the weights per block; hidden units and features become gradients."""
-    turned_out, output_out = store.turned_out, store.output_out  # in a parallel loop, numba would not set a tuple's arrays
     count = gradient.shape[0]
-    for chunk in prange((count + POINTS - 1) // POINTS):
-        begin = np.int64(chunk) * POINTS
+    chunk = take(next_task, 0)
+    while chunk * POINTS < count:
+        begin = chunk * POINTS
         n = min(POINTS, count - begin)
-        turned_out[chunk] = np.float32(0.0)
-        output_out[chunk] = np.float32(0.0)
+        turned_out, output_out = store.turned_out[chunk], store.output_out[chunk]
+        turned_out[:], output_out[:] = _ZERO, _ZERO
         surface_block_backward(
-            store.block[chunk], store.hidden[chunk], gradient[begin : begin + n], n, active, layers, turned_out[chunk], output_out[chunk]
+            store.block[chunk], store.hidden[chunk], gradient[begin : begin + n], n, active, layers, turned_out, output_out
         )
+        chunk = take(next_task, 0)
 
 
-@kernel(parallel=True)
-def surface_positions(gradient, grid, layers, store, positions_out):  # type: ignore[no-untyped-def]
+@kernel()
+def surface_positions(next_task, gradient, grid, layers, store, positions_out):  # type: ignore[no-untyped-def]
     """After ``surface_backward``: gradients of the positions (N, 3)."""
     count = gradient.shape[0]
-    for chunk in prange((count + POINTS - 1) // POINTS):
-        begin = np.int64(chunk) * POINTS
+    chunk = take(next_task, 0)
+    while chunk * POINTS < count:
+        begin = chunk * POINTS
         n = min(POINTS, count - begin)
         out = positions_out[begin : begin + n]
         surface_block_positions(store.block[chunk], store.hidden[chunk], gradient[begin : begin + n], n, grid, layers, out)
+        chunk = take(next_task, 0)
 
 
-@kernel(parallel=True)
-def surface_scatter(count, grid, store, gradient):  # type: ignore[no-untyped-def]
+@kernel()
+def surface_scatter(next_task, count, grid, store, gradient):  # type: ignore[no-untyped-def]
     """The table's gradient, one task per level."""
-    for task in prange(grid.active):
-        level = np.int64(task)  # unsigned otherwise, and the block would be compiled twice
+    level = take(next_task, 0)
+    while level < grid.active:
         for chunk in range((count + POINTS - 1) // POINTS):
             scatter_block(store.block[chunk], np.int64(min(POINTS, count - chunk * POINTS)), grid, gradient, level)
+        level = take(next_task, 0)
 
 
 @part()
@@ -83,18 +89,18 @@ def _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
             states[where[i]] = np.uint8(SOLID if value[i] < -cells.margin else SHELL)
 
 
-@part()
-def _classify_cells(next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
-    """Take tasks until there are none."""
+@kernel()
+def classify(next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
+    """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. store: a slot for each thread."""
     slot, side, n = take(next_task, 1), len(centre), 0
     block, hidden = store.block[slot], store.hidden[slot]
     where, value = np.empty(POINTS, np.int64), np.empty(POINTS, np.float32)
     while True:
-        begin = take(next_task, 0) * _CELLS
+        begin = take(next_task, 0) * CELLS
         if begin >= len(states):
             break
         again = cells.first + (begin - cells.first + cells.every - 1) // cells.every * cells.every  # the next that is looked at anyway
-        for cell in range(begin, min(begin + _CELLS, len(states))):
+        for cell in range(begin, min(begin + CELLS, len(states))):
             if cell == again:
                 again += cells.every
             elif states[cell] != SHELL:
@@ -107,11 +113,3 @@ def _classify_cells(next_task, states, centre, cells, grid, layers, store):  # t
                 _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
                 n = 0
     _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
-
-
-@kernel(parallel=True)
-def classify(threads, next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
-    """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. next_task: (2,), see ``learn_rays``. store: a slot
-    for each thread."""
-    for _ in prange(threads):
-        _classify_cells(next_task, states, centre, cells, grid, layers, store)

@@ -9,11 +9,13 @@ from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
 from mmsynth.field.kernels.cpu.jit import part
+from mmsynth.threads import kernel_threads
 
 T = TypeVar("T")
 
@@ -68,11 +70,24 @@ if hasattr(os, "register_at_fork"):  # Unix: a forked process has none of its pa
     os.register_at_fork(after_in_child=_beside.cache_clear)
 
 
+def take_all(tasks: int, kernel: Callable[..., None], *arguments: Any) -> None:
+    """Call a kernel by as many threads as it may have here (``kernel_threads``), but no more than it has tasks.
+
+    Each takes tasks until none is left and holds no lock of Python's. Numba's own threads would need a kernel around it, for which all that
+    it calls is compiled again; some of their kinds may not be called by several threads.
+
+    Args:
+        arguments: behind the kernel's first, which are the counters (2,) of tasks that were taken, and of threads, each of which has a slot
+            of its own in stores.
+    """
+    take_beside(lambda: None, min(tasks, kernel_threads()), kernel, (np.zeros(2, np.int64), *arguments))
+
+
 def take_beside(meanwhile: Callable[[], T], threads: int, kernel: Callable[..., None], arguments: tuple[Any, ...]) -> T:
     """What ``meanwhile`` gives, which a thread of its own does beside the tasks of a kernel; then it takes such tasks, too.
 
-    threads: in all. Each calls the kernel, which takes tasks until none is left and holds no lock of Python's. Numba's own threads would
-    need a kernel around it, which takes minutes to compile: all that it calls is made for it again.
+    threads: in all. What has not begun when no task is left, because its thread is busy with other work, does not begin: this thread does
+    what is ``meanwhile`` then. So work that a pool's thread does may call kernels itself.
     """
 
     def first_meanwhile() -> T:
@@ -80,16 +95,16 @@ def take_beside(meanwhile: Callable[[], T], threads: int, kernel: Callable[..., 
         kernel(*arguments)
         return result
 
-    if threads == 1:
+    if threads <= 1:
         return first_meanwhile()
     pool = _beside(threads - 1)
     result = pool.submit(first_meanwhile)
-    others = [pool.submit(kernel, *arguments) for _ in range(threads - 2)]
+    others: list[futures.Future[Any]] = [result, *(pool.submit(kernel, *arguments) for _ in range(threads - 2))]
     try:
         kernel(*arguments)
     finally:
-        futures.wait([result])
-        futures.wait(others)
-    for other in others:
+        begun = [other for other in others if not other.cancel()]
+        futures.wait(begun)
+    for other in begun:
         other.result()  # raises what it raised
-    return result.result()
+    return meanwhile() if result.cancelled() else result.result()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, LN2, MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cpu.blocks import (
@@ -16,6 +15,7 @@ from mmsynth.field.kernels.cpu.blocks import (
 )
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
+from mmsynth.field.kernels.cpu.tasks import take
 
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 
@@ -78,17 +78,17 @@ def samples_backward(block, hidden, g, samples, active, layers, turned_out, outp
         surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
 
 
-@kernel(parallel=True)
+@kernel()
 def trace_backward(  # type: ignore[no-untyped-def]
-    behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
+    next_task, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
     """Gradients of what ``trace_forward`` stored: weights per chunk; distances and feature rows are replaced by their gradients.
 
     behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
     """
     rays = behind.shape[0]
-    for task in prange((rays + CHUNK - 1) // CHUNK):
-        chunk = np.int64(task)
+    chunk = take(next_task, 0)
+    while chunk * CHUNK < rays:
         begin = chunk * CHUNK
         count, turned_out, output_out = min(CHUNK, rays - begin), store.turned_out[chunk], store.output_out[chunk]
         rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store)
@@ -103,19 +103,21 @@ def trace_backward(  # type: ignore[no-untyped-def]
             turned_out,
             output_out,
         )
+        chunk = take(next_task, 0)
 
 
-@kernel(parallel=True)
-def trace_scatter(rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
+@kernel()
+def trace_scatter(next_task, rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
     chunks = (rays + CHUNK - 1) // CHUNK
-    for each in prange(grid.active + appearance.active):
-        task = np.int64(each)
+    task = take(next_task, 0)
+    while task < grid.active + appearance.active:
         for chunk in range(chunks):
             if task < grid.active:
                 scatter_block(store.block[chunk], np.int64(store.samples[chunk, 0]), grid, gradient, task)
             else:
                 scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
+        task = take(next_task, 0)
 
 
 @inlined()
@@ -129,13 +131,16 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
     return k * gx + change * x, k * gy + change * y, k * gz + change * z
 
 
-@kernel(parallel=True)
-def trace_rays_backward(origins, directions, grid, layers, appearance, store, origins_out, directions_out):  # type: ignore[no-untyped-def]
+@kernel()
+def trace_rays_backward(  # type: ignore[no-untyped-def]
+    next_task, origins, directions, grid, layers, appearance, store, origins_out, directions_out
+):
     """After ``trace_backward``: gradients to origins and directions, with the samples' ray distances held fixed."""
     rays = origins.shape[0]
     contracted = grid.extent > np.float32(1.0)
-    for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        begin = np.int64(chunk) * CHUNK
+    chunk = take(next_task, 0)
+    while chunk * CHUNK < rays:
+        begin = chunk * CHUNK
         for o in range(begin, min(rays, begin + CHUNK)):
             for a in range(3):
                 origins_out[o, a] = np.float32(0.0)
@@ -162,3 +167,4 @@ def trace_rays_backward(origins, directions, grid, layers, appearance, store, or
                 directions_out[o, 0] += t * gx
                 directions_out[o, 1] += t * gy
                 directions_out[o, 2] += t * gz
+        chunk = take(next_task, 0)
