@@ -506,6 +506,17 @@ def test_sparse_adam_is_torchs(rows: int, dtype: torch.dtype, tolerance: float) 
         torch.testing.assert_close(ours.double(), theirs.detach(), atol=tolerance, rtol=0)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_not_a_number_is_no_gradient_of_zero(dtype: torch.dtype) -> None:
+    """Nor is its line of the cache one without gradients; what lies beside it does not move."""
+    for at in (21, 49):  # in a whole line, and behind the last of them
+        p, gradient, first, second = torch.zeros(4, 50, dtype=dtype)
+        gradient[at] = torch.nan
+        kernels.adam(p, gradient, first, second, kernels.AdamStep(0.01, 0.9, 0.99, 1e-15, 1, sparse=True))
+        for x in (p, first, second):
+            assert torch.nonzero(x.isnan())[:, 0].tolist() == [at] and not x.nan_to_num().any()
+
+
 def test_a_number_met_once_moves_by_about_the_rate() -> None:
     """Its moments would carry it on for ten times as far while other numbers learn."""
     moved = []

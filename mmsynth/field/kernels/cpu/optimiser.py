@@ -18,6 +18,7 @@ from mmsynth.field.kernels.cpu.tasks import take, take_all, wait
 from mmsynth.field.kernels.parameters import AdamPart, AdamStep
 
 ADAM_CHUNK = 16384  # parameters at a time
+_FOR_A_THREAD = 1 << 18  # fewer are done before another thread has begun
 _LINE = 16  # of a line of the cache: where none of them has a gradient, the others are not read
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}  # NaN stays what it is: no gradient of 0
@@ -130,4 +131,4 @@ def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, ste
     """See ``reference.adam``; float32."""
     tensors, numbers = (parameter, gradient, first, second), (np.float32(x) for x in _numbers(step))
     flat = (x.detach().view(-1).numpy() for x in tensors)
-    take_all(-(-parameter.numel() // ADAM_CHUNK), adam_tensor, *flat, *numbers, step.sparse)
+    take_all(-(-parameter.numel() // _FOR_A_THREAD), adam_tensor, *flat, *numbers, step.sparse)

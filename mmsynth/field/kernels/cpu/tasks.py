@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from concurrent import futures
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
@@ -99,12 +98,13 @@ def take_beside(meanwhile: Callable[[], T], threads: int, kernel: Callable[..., 
         return first_meanwhile()
     pool = _beside(threads - 1)
     result = pool.submit(first_meanwhile)
-    others: list[futures.Future[Any]] = [result, *(pool.submit(kernel, *arguments) for _ in range(threads - 2))]
+    others: list[Future[Any]] = [result, *(pool.submit(kernel, *arguments) for _ in range(threads - 2))]
     try:
         kernel(*arguments)
     finally:
         begun = [other for other in others if not other.cancel()]
-        futures.wait(begun)
+        for other in begun:
+            other.exception()  # waits
     for other in begun:
         other.result()  # raises what it raised
     return meanwhile() if result.cancelled() else result.result()
