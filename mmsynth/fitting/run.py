@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -37,6 +36,7 @@ from mmsynth.prior.prior import Prior
 from mmsynth.scene.exposure import Exposure, stated_exposure
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.scene.serialisation import CONVENTIONS, source_to_json
+from mmsynth.threads import usable_cores
 from mmsynth.version import __version__
 
 CHECKPOINT_EVERY = 60.0  # seconds
@@ -260,7 +260,7 @@ def _manifest(trainer: Trainer, scene: Scene) -> dict[str, Any]:
         "grid_reopened": trainer.state.reopened,
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__},
         "threads": torch.get_num_threads(),
-        "cores": os.cpu_count(),
+        "cores": usable_cores(),
         "device": str(trainer.device),
         "conventions": CONVENTIONS,
     }

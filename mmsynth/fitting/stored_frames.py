@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.scene.images import decode, stored_frame
 from mmsynth.scene.scene import Frame, Sensor
+from mmsynth.threads import usable_cores
 
 T = TypeVar("T")
 KINDS = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -77,7 +77,7 @@ def read_frames(frames: Sequence[tuple[Sensor, Frame]], on_load: OnLoad | None =
 def in_threads(work: Callable[[int], T], count: int, on_load: OnLoad | None = None) -> list[T]:
     """Work on each of ``count`` frames, some at a time: what it gives, in their order. The first that fails ends it."""
     out = []
-    pool = ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1))
+    pool = ThreadPoolExecutor(min(_THREADS, usable_cores()))
     try:
         for done in pool.map(work, range(count)):
             out.append(done)

@@ -22,6 +22,8 @@ from typing import Annotated
 
 import typer
 
+from mmsynth.threads import usable_cores
+
 _BEGIN = 60  # steps before the clock starts: of a surface that has a shape
 app = typer.Typer(add_completion=False)
 
@@ -42,7 +44,7 @@ def compare(
             if done.returncode:
                 sys.exit(done.stderr)
             found[count].append(json.loads(done.stdout))
-    cores, threads = len(os.sched_getaffinity(0)), round(found[0][0]["threads"])
+    cores, threads = usable_cores(), round(found[0][0]["threads"])
     median = lambda count, key: statistics.median(result[key] for result in found[count])
     print(f"{cores} cores, {threads} threads; {repeats} fits each of {steps} steps")
     print("busy  steps/s  (all)                CPU s/step  of alone: steps/s   fair   CPU")
@@ -62,8 +64,8 @@ def one(steps: int) -> None:
     import torch
 
     from mmsynth.field.warmup import warm_up
+    from mmsynth.fitting.progress import FitProgress
     from mmsynth.fitting.run import fit
-    from mmsynth.fitting.trainer import FitProgress
     from mmsynth.packaged import data_folder
     from mmsynth.scene.load import load_scene
 
