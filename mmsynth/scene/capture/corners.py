@@ -130,16 +130,16 @@ def _edges(p: np.ndarray, x: np.ndarray, clear: np.ndarray | None) -> tuple[np.n
     sign = np.sign(p[:, 6])[:, None]
     shape, by_log = np.zeros(x.shape[:2]), np.zeros(x.shape[:2])
     by_distance, by_angle = np.zeros(x.shape), np.zeros(x.shape)
+    across, along = offset @ normal.swapaxes(1, 2), offset @ tangent.swapaxes(1, 2)  # (N, K, 2), from each edge and along it
     for place in _WITHIN:
-        at = offset + place
-        value, slope, stretch = _pattern(np.einsum("nkj,nej->nke", at, normal), blur, sign, clear)
+        value, slope, stretch = _pattern(across + (normal @ place)[:, None], blur, sign, clear)
         shape += value / len(_WITHIN)
         by_distance += slope / len(_WITHIN)
-        by_angle += slope * np.einsum("nkj,nej->nke", at, tangent) / len(_WITHIN)
+        by_angle += slope * (along + (tangent @ place)[:, None]) / len(_WITHIN)
         by_log += stretch / len(_WITHIN)
     b = p[:, None, 6]
-    model = p[:, None, 5] + b * shape + np.einsum("nkj,nj->nk", offset, p[:, 7:9])
-    by_crossing = -np.einsum("nke,nej->nkj", b[..., None] * by_distance, normal) - p[:, None, 7:9]
+    model = p[:, None, 5] + b * shape + (offset @ p[:, 7:9, None])[..., 0]
+    by_crossing = -(b[..., None] * by_distance) @ normal - p[:, None, 7:9]
     one = np.ones_like(model)
     derivatives = [by_crossing, b[..., None] * by_angle, (b * by_log)[..., None], one[..., None], shape[..., None], offset]
     return model, np.concatenate(derivatives, -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -43,16 +44,22 @@ TENT = [
 ]
 
 
+@functools.lru_cache(1)
+def _rays(camera: Camera) -> np.ndarray:
+    return ray_map(camera)[0]
+
+
 def _draw(camera: Camera, pose: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
     """(H, W) float32 in [0, 1]: the nearest of textured parallelograms."""
     shape = camera.height, camera.width
-    directions = (ray_map(camera)[0].reshape(-1, 3) @ pose[:3, :3].T).astype(np.float64)
+    directions = (_rays(camera).reshape(-1, 3) @ pose[:3, :3].T).astype(np.float64)
     out, depth = np.full(len(directions), 0.3, np.float32), np.full(len(directions), np.inf)
     for origin, a, b, texture in planes:
-        solved = np.linalg.solve(
-            np.stack(np.broadcast_arrays(a, b, -directions), -1), np.broadcast_to(pose[:3, 3] - origin, directions.shape)[..., None]
-        )[..., 0]
-        u, v, t = solved.T
+        normal, away = np.cross(a, b), pose[:3, 3] - origin
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = -(away @ normal) / (directions @ normal)
+            at = away + t[:, None] * directions
+            u, v = (at @ np.cross(x, y) / (normal @ normal) for x, y in ((b, normal), (normal, a)))
         hit = (u >= 0) & (u < 1) & (v >= 0) & (v < 1) & (t > 0) & (t < depth)
         at = [(x * side - 0.5).astype(np.float32).reshape(shape) for x, side in ((u, texture.shape[1]), (v, texture.shape[0]))]
         values = cv2.remap(texture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
