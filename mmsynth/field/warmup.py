@@ -102,7 +102,7 @@ def run_steps() -> None:
         kernels.learn(kernels.arrange(step))
 
 
-_HALVES = (run_steps, run_operations)  # of about as much to compile
+_HALVES = (run_steps, run_operations)  # the first takes longer, nearly all of it for one kernel
 
 
 def _draw() -> None:
