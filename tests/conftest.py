@@ -8,7 +8,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -159,60 +158,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
 if INTERPRETED:
-    # the interpreter of triton 3.6 takes int() of arrays of one element for the bounds of a loop; numpy 2.4 has no such thing
-    from triton.runtime import interpreter
-
-    patch_tensor, patch_language = interpreter._patch_lang_tensor, interpreter._patch_lang
-
-    def patch_tensor_and_index(tensor: object, scope: interpreter._LangPatchScope) -> None:
-        patch_tensor(tensor, scope)
-        scope.set_attr(tensor, "__index__", lambda self: int(self.handle.data.item()))
-
-    patched: set[str] = set()
-
-    def patch_once(function: FunctionType) -> object:
-        """Functions look for what to patch each time one is called, a fifth of the time; nobody here needs the language as it was."""
-        if function.__module__ not in patched:
-            patched.add(function.__module__)
-            patch_language(function)
-        return interpreter._LangPatchScope()  # has nothing to restore
-
-    # a third of its time goes into names of types, which nobody reads, and into a table of all for each look at one
-    from triton.language import core
-
-    def name_of(self: Any) -> str:
-        return "[" + ",".join(f"{field}:{kind}" for field, kind in zip(self.fields, self.types, strict=True)) + "]"
-
-    def keep_types(self: Any, types: Any, fields: Any = None) -> None:
-        self.types, self.fields = types, fields or [""] * len(types)
-
-    def keep_values(self: Any, args: Iterable[Any], type: Any = None) -> None:
-        self.values = list(args)
-        self.known_type = type if type is None or isinstance(type, core.tuple_type) else core.tuple_type(type)
-
-    def type_of(self: Any) -> Any:
-        if self.known_type is None:
-            self.known_type = core._type_for_tuple_values(self.values)
-        return self.known_type
-
-    core.tuple_type.__init__, core.tuple_type.name = keep_types, property(name_of)
-    core.tuple.__init__, core.tuple.type = keep_values, property(type_of, lambda self, type: setattr(self, "known_type", type))
-    find_dtype, dtypes = interpreter._get_np_dtype, {}
-
-    def dtype_of(kind: Any) -> np.dtype[Any]:
-        name = kind.scalar.name
-        if name not in dtypes:
-            dtypes[name] = find_dtype(kind.scalar)
-        return dtypes[name]
-
-    interpreter._get_np_dtype = dtype_of
-    interpreter._patch_lang_tensor = patch_tensor_and_index
-    interpreter._patch_lang = patch_once
-
-    # a round takes it as long for one ray as for many
-    from mmsynth.field.kernels.cuda import tracing
-
-    tracing.MARCH_LANES = 128
+    import quick_interpreter  # noqa: F401
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
