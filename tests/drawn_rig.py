@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -82,6 +84,16 @@ def seen_corners(
     return out
 
 
+@functools.lru_cache(maxsize=1)  # most draw several pictures of one camera
+def _fine_rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    return ray_map(
+        Camera(
+            camera.width * samples, camera.height * samples, camera.fx * samples, camera.fy * samples, (camera.cx + 0.5) * samples - 0.5,
+            (camera.cy + 0.5) * samples - 0.5, camera.distortion, camera.lens,
+        )
+    )  # fmt: skip
+
+
 def drawn(board: Board, pose: np.ndarray, camera: Camera, samples: int = 3) -> np.ndarray:
     """(H, W) float32: a board (4, 4 board → camera) on grey through a lens, by rays at several places of each photosite."""
     pixels = 48
@@ -98,19 +110,19 @@ def drawn(board: Board, pose: np.ndarray, camera: Camera, samples: int = 3) -> n
     if board.inverted:
         art = 1 - art
     start = 0.0 if board.kind == "charuco" else -board.square
-    fine = Camera(
-        camera.width * samples, camera.height * samples, camera.fx * samples, camera.fy * samples, (camera.cx + 0.5) * samples - 0.5,
-        (camera.cy + 0.5) * samples - 0.5, camera.distortion, camera.lens,
-    )  # fmt: skip
-    rays, valid = ray_map(fine)
+    rays, valid = _fine_rays(camera, samples)
     to_board = inverse(pose)
-    directions, origin = rays @ to_board[:3, :3].T, to_board[:3, 3]
+    directions, origin = to_board[:3, :3] @ rays.reshape(-1, 3).T, to_board[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        hit = origin[:2] - origin[2] / directions[..., 2:] * directions[..., :2]
-    at = np.nan_to_num((hit - start) / board.square * pixels - 0.5, nan=-1e6).astype(np.float32)
-    inside = valid & (at > -0.5).all(-1) & (at < np.array([columns, rows]) * pixels - 0.5).all(-1)
-    margin = valid & (at > -pixels / 2).all(-1) & (at < (np.array([columns, rows]) + 0.5) * pixels).all(-1)
-    picture = np.where(margin, 0.0 if board.inverted else 1.0, 0.45).astype(np.float32)
-    picture = np.where(inside, cv2.remap(art, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), picture)
+        away = -origin[2] / directions[2]
+        x, y = ((((origin[i] + away * directions[i]) - start) / board.square * pixels - 0.5).reshape(valid.shape) for i in (0, 1))
+
+    def within(least: float, most: float) -> np.ndarray:
+        return valid & (x > least) & (y > least) & (x < columns * pixels + most) & (y < rows * pixels + most)
+
+    inside, margin = within(-0.5, -0.5), within(-pixels / 2, pixels / 2)
+    picture = np.where(margin, np.float32(0.0 if board.inverted else 1.0), np.float32(0.45))
+    places = (np.where(inside, at, 0.0).astype(np.float32) for at in (x, y))
+    picture = np.where(inside, cv2.remap(art, *places, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), picture)
     mean = picture.reshape(camera.height, samples, camera.width, samples).mean((1, 3))
     return (0.05 + 0.7 * mean).astype(np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mmsynth.fitting import candidates, decisions, lighting, measurements, needs, refinement, table_sizes, unseen
+from mmsynth.fitting import candidates, decisions, lighting, measurements, needs, refinement, table_sizes, trainer, unseen
 
 
 def few_looks(monkeypatch: pytest.MonkeyPatch, rays: int = 64) -> None:
@@ -12,7 +12,7 @@ def few_looks(monkeypatch: pytest.MonkeyPatch, rays: int = 64) -> None:
     for module, name, number in (
         (candidates, "_STEPS", 2), (decisions, "_RAYS", rays), (lighting, "_RAYS", rays), (measurements, "_TYPICAL", 1024),
         (needs, "_LOOKED_AT", 256), (refinement, "_AT_ONCE", rays), (refinement, "_DECIDE", 2), (refinement, "_PER_STEP", 2 * rays),
-        (refinement, "_PER_VIEW", 1), (table_sizes, "_PROBES", 8 * rays),
+        (refinement, "_PER_VIEW", 1), (trainer, "_MOVE_EVERY", 1), (table_sizes, "_PROBES", 8 * rays),
         (unseen, "_RAYS", 64 * rays), (unseen, "_RAYS_AT_ONCE", 16 * rays),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, number)

@@ -47,6 +47,7 @@ _BAD_STEPS = 20
 _MOST_RAYS = 65536
 _OUTSIDE = 4  # rays into the masks for each that passes outside: these say little, and cost as much (measured on one scene)
 _RENEW_EVERY = 16  # steps: where rays go
+_MOVE_EVERY = 8  # steps at least: the field learns from where cameras are before they move again
 _AVERAGE_EVERY = 4  # steps: as good as every one of them, at a quarter of its cost
 
 
@@ -255,7 +256,7 @@ class Trainer:
                 if field.shines:  # by now lamps have found their places
                     keep_bright_lamps(field, self.measurements, sampling, self.seed)
                 self._see_directions(state.decided)
-        if self.refinement.due(self.progress):
+        if state.step % _MOVE_EVERY == 0 and self.refinement.due(self.progress):
             self.refinement.step(functools.partial(self._look, sampling), self.progress)
         settled = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided)), *field.view_dependence.values()
         if settled != self.settled:

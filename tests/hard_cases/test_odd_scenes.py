@@ -232,25 +232,26 @@ def _between_planes(scene: Scene, scale: float) -> float:
     return float(np.mean([np.mean((d > 0.05) & (d < 1000.0)) for d in depths]))
 
 
+@pytest.fixture(scope="module")
+def in_metres(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Field]:
+    folder = tmp_path_factory.mktemp("plain")
+    return folder / "scene", _fit(folder, {"rgb": around(6)})
+
+
 @pytest.mark.parametrize("scale", [2.0**10, 2.0**-10, 1000.0, 1e-3, 1e6])
-def test_scenes_in_any_unit(row: Row, tmp_path: Path, scale: float) -> None:
+def test_scenes_in_any_unit(row: Row, tmp_path: Path, in_metres: tuple[Path, Field], scale: float) -> None:
     """In millimetres or in kilometres: the same fit. To the last bit where the factor is a power of two."""
-
-    def scaled(factor: float) -> list[np.ndarray]:
-        out = around(6)
-        for pose in out:
-            pose[:3, 3] *= factor
-        return out
-
-    plain = _fit(tmp_path / "plain", {"rgb": scaled(1.0)})
-    other = _fit(tmp_path / "other", {"rgb": scaled(scale)}, scale=scale)
+    poses, (folder, plain) = around(6), in_metres
+    for pose in poses:
+        pose[:3, 3] *= scale
+    other = _fit(tmp_path / "other", {"rgb": poses}, scale=scale)
     assert other.region.radius == pytest.approx(scale * plain.region.radius, rel=1e-6)
     difference = abs(other.manifest["train_psnr"]["rgb"] - plain.manifest["train_psnr"]["rgb"])
     if math.log2(scale).is_integer():
         assert all(torch.equal(a, b) for a, b in zip(plain.parameters(), other.parameters(), strict=True))
     assert difference < 0.3
     usual = _between_planes(load_scene(tmp_path / "other" / "scene"), scale)
-    assert _between_planes(load_scene(tmp_path / "plain" / "scene"), 1.0) == 1 and usual < 0.5
+    assert _between_planes(load_scene(folder), 1.0) == 1 and usual < 0.5
     row(
         f"a world {scale:g} times as large",
         f"nerfstudio's planes at 0.05 and 1000, poses as they are: {usual:.0%} of the rays meet the ball between them",

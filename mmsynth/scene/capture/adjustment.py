@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from mmsynth.scene.capture.derivatives import project_with_derivatives
+from mmsynth.scene.capture.derivatives import project_with_derivatives, projected
 from mmsynth.scene.motion import cross_matrix, motion_to_matrix
 from mmsynth.sensors.camera import Camera
 
@@ -130,7 +130,7 @@ class _Problem:
         out = np.empty((len(self.points), 2))
         for s, rows in enumerate(self.rows):
             camera = state.cameras[s]
-            apart = self.pixels[rows] - project_with_derivatives(self._local(state, s), camera)[0]
+            apart = self.pixels[rows] - projected(self._local(state, s), camera)
             lost = ~np.isfinite(apart).all(1, keepdims=True)
             out[rows] = np.where(lost, float(np.hypot(camera.width, camera.height)), apart)
         return out

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mmsynth.scene.capture.adjustment import Adjusted, RigState, View, adjust
-from mmsynth.scene.capture.derivatives import project_with_derivatives
+from mmsynth.scene.capture.derivatives import projected
 from mmsynth.sensors.camera import Camera, Lens, unproject
 
 MODELS: dict[str, tuple[Lens, tuple[int, ...]]] = {
@@ -153,7 +153,7 @@ def _ideal(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 def errors_of(camera: Camera, view: View, pose: np.ndarray) -> np.ndarray:
     """(N,) px; infinite where a corner has no pixel."""
-    seen = project_with_derivatives(view.points @ pose[:3, :3].T + pose[:3, 3], camera)[0]
+    seen = projected(view.points @ pose[:3, :3].T + pose[:3, 3], camera)
     error = np.linalg.norm(view.pixels - seen, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
@@ -194,7 +194,7 @@ def _held_out(adjusted: Adjusted, views: Sequence[View]) -> np.ndarray:
         camera = fitted.state.cameras[0]
         for view, keep in zip(views, kept, strict=True):
             pose = fitted.state.boards[view.pose]
-            seen = project_with_derivatives(view.points[~keep] @ pose[:3, :3].T + pose[:3, 3], camera)[0]
+            seen = projected(view.points[~keep] @ pose[:3, :3].T + pose[:3, 3], camera)
             out.append(np.where(np.isfinite(seen), view.pixels[~keep] - seen, 1e3))
     return np.concatenate(out)
 

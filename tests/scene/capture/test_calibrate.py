@@ -12,7 +12,7 @@ from mmsynth.errors import InputError
 from mmsynth.scene.capture.adjustment import View
 from mmsynth.scene.capture.board import corner_points
 from mmsynth.scene.capture.calibrate import Calibration, calibrate_found
-from mmsynth.scene.capture.derivatives import project_with_derivatives
+from mmsynth.scene.capture.derivatives import project_with_derivatives, projected
 from mmsynth.scene.capture.lens_choice import calibrate_alone
 from mmsynth.scene.motion import inverse
 from mmsynth.sensors.camera import Camera, project_points
@@ -31,6 +31,7 @@ def test_derivatives_are_those_of_automatic_differentiation(camera: Camera) -> N
     random = np.random.default_rng(0)
     points = random.uniform(-0.4, 0.4, (20, 3)) + [0, 0, 1]
     pixels, by_point, by_camera = project_with_derivatives(points, camera)
+    np.testing.assert_array_equal(projected(points, camera), pixels)
 
     def model(p: torch.Tensor, intrinsics: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
         return project_points(p, intrinsics, coefficients, camera.lens)[0]
