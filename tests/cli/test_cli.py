@@ -1,11 +1,13 @@
 """The commands as a user runs them: in a folder of their own, on the packaged example scene; each once as a process of its own."""
 
+import contextlib
 import json
 import os
 import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -22,15 +24,9 @@ pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
 ROOT = Path(__file__).parents[2]
 
 
-def run(cwd: Path, *args: str, largest_file: int | None = None, **variables: str) -> subprocess.CompletedProcess[str]:
-    def limit() -> None:
-        if largest_file is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
-
+def run(cwd: Path, *args: str, **variables: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", **variables}
-    return subprocess.run(
-        [sys.executable, "-m", "mmsynth", *args], cwd=cwd, env=environment, capture_output=True, text=True, preexec_fn=limit
-    )
+    return subprocess.run([sys.executable, "-m", "mmsynth", *args], cwd=cwd, env=environment, capture_output=True, text=True)
 
 
 def here(cwd: Path, *args: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -44,6 +40,17 @@ def here(cwd: Path, *args: str, **variables: str) -> subprocess.CompletedProcess
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return subprocess.CompletedProcess(args, result.exit_code, result.stdout, result.stderr)
+
+
+@contextlib.contextmanager
+def no_file_larger_than(size: int) -> Iterator[None]:
+    """The kernel lets none grow past it, as a full disk would."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -169,7 +176,7 @@ METHODS = ("ratio", "guided", "linear", "nearest")
 
 
 def test_evaluate_conversions(fitted: Path) -> None:
-    result = run(fitted, "evaluate", "--convert", "rgb:ms,mono:pol", "--json")
+    result = here(fitted, "evaluate", "--convert", "rgb:ms,mono:pol", "--json")
     assert result.returncode == 0, result.stderr
     first, second = json.loads(result.stdout)["conversions"]
     assert (first["source"], first["target"], first["truth"]) == ("rgb", "ms", "aligned")
@@ -223,7 +230,7 @@ def test_two_processes_make_the_dataset_of_one(fitted: Path, tmp_path: Path) -> 
     assert here(fitted, *command, "--out", str(tmp_path / "one")).returncode == 0
     outputs = []
     for rank in ("1", "0"):
-        result = run(fitted, *command, "--out", str(tmp_path / "two"), RANK=rank, WORLD_SIZE="2")
+        result = here(fitted, *command, "--out", str(tmp_path / "two"), RANK=rank, WORLD_SIZE="2")
         assert result.returncode == 0, result.stderr
         outputs.append(result.stdout)
     assert "process 1 of 2" in outputs[0] and "wrote 5 views" in outputs[1]
@@ -404,14 +411,15 @@ def test_bad_requests_on_a_run_are_refused(fitted: Path) -> None:
 
 
 def test_a_full_disk_leaves_nothing_half_written(fitted: Path, tmp_path: Path) -> None:
-    """The kernel refuses to let a file grow past a limit, as a full disk would."""
-    refused(run(tmp_path, "fit", "example", "--steps", "3", largest_file=100_000), "could not be written")
+    with no_file_larger_than(100_000):
+        refused(here(tmp_path, "fit", "example", "--steps", "3"), "could not be written")
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
     for args in (
         ("mesh", "--resolution", "64", "--out", str(tmp_path / "m.ply")),
         ("convert", "--from", "rgb", "--to", "ms", "--out", str(tmp_path / "c")),
     ):
-        refused(run(fitted, *args, largest_file=20_000), "could not be written")
+        with no_file_larger_than(20_000):
+            refused(here(fitted, *args), "could not be written")
     assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.suffix != ".json" and p.stat().st_size == 20_000]
     assert not list(tmp_path.rglob("*tmp*"))
 
