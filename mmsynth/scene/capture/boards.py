@@ -26,8 +26,7 @@ def board_points(frames: Sequence[Frame]) -> np.ndarray:
     """Corners of ArUco markers (those of ChArUco boards, too), triangulated: (N, 3) in the poses' frame; N = 0 where there are none.
 
     Args:
-        frames: of a sensor without a mosaic. Up to 16 of them are searched, evenly spread: 4 for markers of any dictionary,
-            the others for those of the dictionaries that were found there.
+        frames: of a sensor without a mosaic. Up to 16 of them are searched, evenly spread, and no more when 4 show no marker.
     """
     return np.array(list(board_corners(frames, _grey).values()), dtype=np.float64).reshape(-1, 3)
 
@@ -44,16 +43,17 @@ def board_corners(frames: Sequence[Frame], picture: Callable[[Frame], np.ndarray
     spread = np.linspace(0, len(order) - 1, min(_LOOK, len(order))).round().astype(int)
     sightings: dict[Corner, list[Sighting]] = defaultdict(list)
 
-    def look(frame: Frame, dictionaries: Sequence[int]) -> None:
+    def look(frame: Frame) -> None:
         grey = picture(frame)
-        for corner, pixel in ({} if grey is None else markers_in(grey, dictionaries)).items():
+        for corner, pixel in ({} if grey is None else markers_in(grey)).items():
             sightings[corner].append((frame, pixel))
 
     for i in order[spread]:
-        look(frames[i], _DICTIONARIES)
-    there = sorted({dictionary for dictionary, _, _ in sightings})  # to look for all four takes four times as long
-    for i in np.delete(order, spread) if there else ():
-        look(frames[i], there)
+        look(frames[i])
+    if not sightings:
+        return {}
+    for i in np.delete(order, spread):
+        look(frames[i])
     return {corner: point for corner, seen in sightings.items() if (point := _triangulated(seen)) is not None}
 
 
@@ -65,18 +65,14 @@ def _grey(frame: Frame) -> np.ndarray | None:
     return np.asarray(image.reshape(*image.shape[:2], -1)[..., :3].mean(-1))
 
 
-def markers_in(grey: np.ndarray, dictionaries: Sequence[int] = _DICTIONARIES) -> dict[Corner, np.ndarray]:
-    """Corners of ArUco markers in a linear picture (H, W): (2,) px each; of a marker that is there twice, neither.
-
-    Args:
-        dictionaries: OpenCV's numbers of those whose markers are looked for.
-    """
+def markers_in(grey: np.ndarray) -> dict[Corner, np.ndarray]:
+    """Corners of ArUco markers in a linear picture (H, W): (2,) px each; of a marker that is there twice, neither."""
     level = np.sqrt(np.clip(grey / max(float(np.quantile(grey, 0.99)), 1e-9), 0.0, 1.0))
     scale = min(1.0, _WIDTH / max(grey.shape))
     small = cv2.resize((255 * level).astype(np.uint8), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     out: dict[Corner, np.ndarray] = {}
     twice: set[Corner] = set()
-    for name in dictionaries:
+    for name in _DICTIONARIES:
         found, ids, _ = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(name)).detectMarkers(small)
         for corners, marker in zip(found, [] if ids is None else np.ravel(ids), strict=True):
             for k, place in enumerate(corners[0]):
