@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from few_looks import few_looks
 from typer.testing import CliRunner
 
 from mmsynth.cli import app
@@ -65,7 +66,9 @@ def refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("work")
-    result = run(folder, "fit", "example", "--steps", "25", "--json")
+    with pytest.MonkeyPatch.context() as patch:
+        few_looks(patch)
+        result = here(folder, "fit", "example", "--steps", "25", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["steps"] == 25
     return folder
@@ -94,12 +97,14 @@ def test_a_device_that_is_none_is_refused_before_anything_is_opened(tmp_path: Pa
     refused(here(tmp_path, *command.split(), "--device", "tpu"), "--device 'tpu': expected auto, cpu or cuda")
 
 
-def test_fit_leaves_a_run(fitted: Path) -> None:
-    latest = fitted / "runs" / "latest"
-    assert latest.resolve() == (fitted / "runs" / "example_scene").resolve()
+def test_fit_leaves_a_run(tmp_path: Path) -> None:
+    result = run(tmp_path, "fit", "example", "--steps", "3", "--json")
+    assert result.returncode == 0 and json.loads(result.stdout)["steps"] == 3, result.stderr
+    latest = tmp_path / "runs" / "latest"
+    assert latest.resolve() == (tmp_path / "runs" / "example_scene").resolve()
     for name in ("field.safetensors", "manifest.json", "train.jsonl", "report.html", "preview.png", "checkpoint/state.pt"):
         assert (latest / name).stat().st_size > 0, name
-    assert not list(fitted.rglob("*.tmp*"))
+    assert not list(tmp_path.rglob("*.tmp*"))
 
 
 def test_info(tmp_path: Path) -> None:

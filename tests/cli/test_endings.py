@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from few_looks import few_looks
 from test_cli import ROOT, here, refused
 
 from mmsynth.fitting.checkpoint import read_checkpoint
@@ -28,7 +29,9 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a copy of the example, and a run of it."""
     folder = tmp_path_factory.mktemp("work")
     shutil.copytree(data_folder("example_scene"), folder / "scene", ignore=shutil.ignore_patterns("gt"))
-    assert here(folder, *FIT, "3").returncode == 0
+    with pytest.MonkeyPatch.context() as patch:
+        few_looks(patch)
+        assert here(folder, *FIT, "3").returncode == 0
     (folder / "poses.json").write_text('{"trajectory": "orbit", "views": 2}')
     (folder / "scenes.txt").write_text("scene\n")
     return folder
