@@ -13,6 +13,8 @@ were drawn without noise (squares of 9 to 13 pixels) were off by 0.02 to 0.03 px
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import ndtr
 
@@ -20,7 +22,7 @@ _WINDOW = 12  # pixels from the corner at the most: edges are straight there
 _REACH = 0.42  # of a square
 _CLEAR = 1.5  # pixels by which the inside of a marker blurs into its black border
 _BLUR = (-2.0, 1.5)  # logarithms of σ [px]
-_WITHIN = [np.array([i, j]) / 3 for i in (-1, 0, 1) for j in (-1, 0, 1)]  # places within a photosite, whose light it gathers
+_WITHIN = [(i / 3, j / 3) for i in (-1, 0, 1) for j in (-1, 0, 1)]  # places within a photosite, whose light it gathers
 _STEPS, _REST = 25, 1e-4  # of Gauss and Newton; px that a corner moves at the last of them
 _MISFIT = 0.3  # rms of what is not explained, relative to half the contrast of black and white
 _AWAY = 0.3  # of a square's shortest side [px] by which a corner may move, or two pixels
@@ -122,55 +124,53 @@ def _gauss_newton(
 
 def _edges(p: np.ndarray, x: np.ndarray, clear: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """The model at pixels (N, K, 2): (N, K), and its derivatives (N, K, 9)."""
-    cos, sin = np.cos(p[:, 2:4]), np.sin(p[:, 2:4])
-    normal = np.stack([cos, sin], -1)  # (N, 2, 2)
-    tangent = np.stack([-sin, cos], -1)
-    blur = np.exp(p[:, 4])[:, None, None]
-    offset = x - p[:, None, :2]
-    sign = np.sign(p[:, 6])[:, None]
-    shape, by_log = np.zeros(x.shape[:2]), np.zeros(x.shape[:2])
-    by_distance, by_angle = np.zeros(x.shape), np.zeros(x.shape)
-    across, along = offset @ normal.swapaxes(1, 2), offset @ tangent.swapaxes(1, 2)  # (N, K, 2), from each edge and along it
-    for place in _WITHIN:
-        value, slope, stretch = _pattern(across + (normal @ place)[:, None], blur, sign, clear)
-        shape += value / len(_WITHIN)
-        by_distance += slope / len(_WITHIN)
-        by_angle += slope * (along + (tangent @ place)[:, None]) / len(_WITHIN)
-        by_log += stretch / len(_WITHIN)
-    b = p[:, None, 6]
-    model = p[:, None, 5] + b * shape + (offset @ p[:, 7:9, None])[..., 0]
-    by_crossing = -(b[..., None] * by_distance) @ normal - p[:, None, 7:9]
-    one = np.ones_like(model)
-    derivatives = [by_crossing, b[..., None] * by_angle, (b * by_log)[..., None], one[..., None], shape[..., None], offset]
-    return model, np.concatenate(derivatives, -1)
+    cos, sin = ((f(p[:, 2, None]), f(p[:, 3, None])) for f in (np.cos, np.sin))  # (N, 1), of each edge's normal
+    blur, sign = np.exp(p[:, 4, None]), np.sign(p[:, 6, None])
+    right, down = x[..., 0] - p[:, 0, None], x[..., 1] - p[:, 1, None]
+    across, along = ([c * u + s * v for c, s in zip(cos, sin, strict=True)] for u, v in ((right, down), (down, -right)))
+    shape, by_log = np.zeros(right.shape), np.zeros(right.shape)
+    by_distance, by_angle = ([np.zeros(right.shape), np.zeros(right.shape)] for _ in range(2))
+    for u, v in _WITHIN:
+        distance = [a + (c * u + s * v) for a, c, s in zip(across, cos, sin, strict=True)]
+        value, slopes, stretch = _pattern(distance, blur, sign, clear)
+        shape += value
+        by_log += stretch
+        for edge in range(2):
+            by_distance[edge] += slopes[edge]
+            by_angle[edge] += slopes[edge] * (along[edge] + (cos[edge] * v - sin[edge] * u))
+    shape /= len(_WITHIN)
+    b, tilt, each = p[:, 6, None], p[:, 7:9, None], p[:, 6, None] / len(_WITHIN)
+    model = p[:, 5, None] + b * shape + (right * tilt[:, 0] + down * tilt[:, 1])
+    by_crossing = [-each * (n[0] * by_distance[0] + n[1] * by_distance[1]) - tilt[:, i] for i, n in enumerate((cos, sin))]
+    derivatives = [*by_crossing, each * by_angle[0], each * by_angle[1], each * by_log, np.ones_like(model), shape, right, down]
+    return model, np.stack(derivatives, -1)
 
 
 def _pattern(
-    distance: np.ndarray, blur: np.ndarray, sign: np.ndarray, clear: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    distance: Sequence[np.ndarray], blur: np.ndarray, sign: np.ndarray, clear: np.ndarray | None
+) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
     """1 on squares of one colour, -1 on those of the other and on the markers' borders, blurred.
 
     Args:
-        distance: (N, K, 2) from the edges. blur: (N, 1, 1). sign: (N, 1) 1 where both distances have one sign on white squares, else -1.
-        clear: (N, 2) from an edge to the border beside it; None: no markers.
+        distance: (N, K) from each of the two edges. blur: (N, 1). sign: (N, 1) 1 where both distances have one sign on white squares,
+            else -1. clear: (N, 2) from an edge to the border beside it; None: no markers.
     Returns:
-        (N, K), its derivatives by the distances (N, K, 2) and by log σ (N, K).
+        (N, K), its derivatives by the two distances (N, K) and by log σ (N, K).
     """
-    t = distance / blur
-    step, bell = ndtr(t), _bell(t)
-    u, v = 2 * step[..., 0] - 1, 2 * step[..., 1] - 1
-    value, by_t = u * v, 2 * np.stack([bell[..., 0] * v, u * bell[..., 1]], -1)
-    by_log = -(by_t * t).sum(-1)
+    t, s = distance[0] / blur, distance[1] / blur
+    u, v = 2 * ndtr(t) - 1, 2 * ndtr(s) - 1
+    value, by_t, by_s = u * v, 2 * _bell(t) * v, 2 * u * _bell(s)
+    by_log = -(by_t * t + by_s * s)
     if clear is not None:
-        c = clear[:, None] / blur
+        c = clear / blur
         for way in (1.0, -1.0):  # two squares are white
-            p, q = way * t[..., 0] - c[..., 0], way * sign * t[..., 1] - c[..., 1]
+            p, q = way * t - c[:, :1], way * sign * s - c[:, 1:]
             right, down = ndtr(p), ndtr(q)
             by_p, by_q = -2 * sign * _bell(p) * down, -2 * sign * right * _bell(q)
             value = value - 2 * sign * right * down
-            by_t = by_t + np.stack([way * by_p, way * sign * by_q], -1)
+            by_t, by_s = by_t + way * by_p, by_s + way * sign * by_q
             by_log = by_log - (by_p * p + by_q * q)
-    return value, by_t / blur, by_log
+    return value, [by_t / blur, by_s / blur], by_log
 
 
 def _bell(t: np.ndarray) -> np.ndarray:
