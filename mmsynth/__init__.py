@@ -21,8 +21,9 @@ A ``Field`` renders any camera at any pose: ``Field.render`` → ``Rendering``. 
 ``InputError``, a fit that diverged ``DivergedError``, with one sentence each. Names are loaded when first used, so that ``mmsynth --help``
 does not wait for torch.
 
-The command line sets ``GOMP_SPINCOUNT=1000`` before torch is loaded, so that its threads do not spin beside another busy process; a script
-that shares its machine may want the same. ``OMP_NUM_THREADS`` limits the threads of kernels, too.
+The command line sets ``GOMP_SPINCOUNT=1000`` before torch is loaded, so that its threads do not spin beside another busy process, and looks
+for garbage less often, so that it starts sooner; a script may want the same (``mmsynth.process``). ``OMP_NUM_THREADS`` limits the threads
+of kernels, too.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import worker  # noqa: F401
+
+# isort: split
 import json
 import os
 import signal
@@ -15,6 +18,7 @@ import pytest
 import torch
 from few_looks import few_looks
 
+from mmsynth.bench import machine
 from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera
@@ -26,11 +30,6 @@ sys.path.append(str(Path(__file__).parent / "field"))  # cases of the CPU's kern
 # a script's background job begins with SIGINT ignored, and so would what tests interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-if "PYTEST_XDIST_WORKER" in os.environ:
-    # two threads a process on two cores wait for each other at every barrier; a test may still ask for more
-    torch.set_num_threads(1)
-    let_kernels_have(1)
-    os.environ["OMP_NUM_THREADS"] = "1"  # of commands that tests start
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -112,6 +111,12 @@ def write_transforms(tmp_path: Path) -> Callable[..., Path]:
         return root
 
     return write
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _machines_measured_briefly() -> None:
+    """Once instead of the best of five, for the many reports of tests; the tests of tables do not read these numbers."""
+    machine._REPEATS = 1
 
 
 @pytest.fixture

@@ -45,8 +45,9 @@ def _compile_apart(calls: Sequence[Callable[[], None]]) -> None:
         children: list[subprocess.Popen[bytes]] = []
         try:
             for call, cache in zip(calls, caches, strict=True):
-                command = [sys.executable, "-c", f"from mmsynth.field import warmup; warmup.{call.__name__}()"]
+                program = f"from mmsynth.process import set_up; set_up(); from mmsynth.field import warmup; warmup.{call.__name__}()"
                 environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(cache)}
+                command = [sys.executable, "-c", program]
                 children.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
             for child in children:
                 child.wait()

@@ -12,15 +12,16 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
 
 from mmsynth.files import write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _HERE = Path(__file__).parent
 _NUMBER = re.compile(r"[-+<]? ?\d[\d.,]*(e[-+]?\d+)?( ?[%°])?( ± .*)?")
@@ -49,6 +50,8 @@ def write_page(path: Path, body: str, values: Mapping[str, Any]) -> None:
 
 def svg(figure: Figure) -> str:
     """A figure as an SVG element; the same figure gives the same text."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG  # a second to import, and most pages have no figure
+
     stream = io.StringIO()
     FigureCanvasSVG(figure).print_svg(stream, metadata={"Date": None})
     text = stream.getvalue()

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from mmsynth.errors import InputError
 from mmsynth.fitting.choices import choices_of
@@ -113,6 +112,8 @@ def curve_svg(log: Sequence[Mapping[str, Any]]) -> str:
     """
     if not log:
         return ""
+    from matplotlib.figure import Figure  # a second to import: a fit begins without
+
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     seconds = np.array([entry.get("elapsed", entry.get("step", i)) for i, entry in enumerate(log)], float)

@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import OpenEXR
-import tifffile
 
 from mmsynth.errors import InputError
 from mmsynth.files import write_atomic
@@ -40,6 +39,8 @@ def write_png(path: Path, numbers: np.ndarray) -> None:
 
 def write_tiff(path: Path, numbers: np.ndarray) -> None:
     """Write numbers (H, W) or (H, W, C) as they are (zlib, any channel count)."""
+    import tifffile  # a quarter of a second to import
+
     photometric = "rgb" if numbers.ndim == 3 and numbers.shape[2] == 3 else "minisblack"
     options: dict[str, Any] = {"planarconfig": "contig" if numbers.ndim == 3 else None, "compression": "zlib", "metadata": None}
     write_atomic(Path(path), lambda temporary: tifffile.imwrite(temporary, numbers, photometric=photometric, **options))
@@ -56,6 +57,8 @@ def write_dng(path: Path, numbers: np.ndarray, pattern: np.ndarray, black: int, 
         numbers: (H, W) uint16. pattern: (2, 2), 0 red, 1 green, 2 blue. black, white: of ``numbers``. model: of the camera.
             Its colour matrix is that of sRGB: the file says what was measured, not which colours they are.
     """
+    import tifffile
+
     rational = lambda values: tuple(x for v in values for x in (round(v * 10000), 10000))
     extra = [
         (33421, "H", 2, (2, 2), True),  # CFARepeatPatternDim

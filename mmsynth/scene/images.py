@@ -23,7 +23,6 @@ from typing import IO
 import cv2
 import numpy as np
 import OpenEXR
-import tifffile
 
 from mmsynth.errors import InputError, is_out_of_memory
 from mmsynth.scene.scene import Frame, Sensor
@@ -245,6 +244,8 @@ def _read_photo(path: Path) -> np.ndarray:
 
 def _read_tiff(path: Path) -> np.ndarray:
     """Samples stored in planes, and pages of one size, become channels: always (H, W) or (H, W, C)."""
+    import tifffile  # a quarter of a second to import
+
     with tifffile.TiffFile(path) as file:
         size = path.stat().st_size
         for page in file.pages:
@@ -259,6 +260,8 @@ def _read_tiff(path: Path) -> np.ndarray:
 
 def _read_dng(path: Path) -> np.ndarray:
     """The mosaic as stored, (H, W); previews beside it are passed over."""
+    import tifffile
+
     with tifffile.TiffFile(path) as file:
         pages = [page for top in file.pages if isinstance(top, tifffile.TiffPage) for page in (top, *(top.pages or ()))]
         for page in pages:

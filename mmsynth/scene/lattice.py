@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 _STEPS = (0.02, 0.04, 0.08, 0.16)  # in cube roots of values: what counts as an edge, in clean pictures and in noisy ones
 _SMALLEST, _LARGEST = 6.0, 0.2  # side of an even square: pixels, of the shorter side of the picture
@@ -71,6 +74,8 @@ def _even_patches(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _distinct(middles: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of patches seen at several thresholds the largest."""
+    from scipy.spatial import KDTree  # half a second to import: a fit without a chart begins without
+
     kept: list[int] = []
     tree = KDTree(middles)
     left = np.ones(len(middles), bool)
@@ -82,6 +87,8 @@ def _distinct(middles: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _lattices_of(middles: np.ndarray, sides: np.ndarray) -> list[Lattice]:
+    from scipy.spatial import KDTree
+
     out: list[Lattice] = []
     if len(middles) < _LEAST:
         return out

@@ -10,8 +10,6 @@ from dataclasses import field as of_dataclass
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
 from mmsynth.field.field import Field
 from mmsynth.operations.output import previews
@@ -145,6 +143,9 @@ def answer_html(field: Field, answer: Answer, pixels_of: Callable[[Frame], np.nd
 
 def _plots(field: Field, answer: Answer) -> str:
     """Channels without a wavelength as bars, those with one as spectra, polarization as ellipses; an SVG."""
+    from matplotlib.figure import Figure  # a second to import: a viewer opens without
+    from matplotlib.patches import Ellipse
+
     rest, waves = ([band for band in answer.bands if (band.nm is None) == alone] for alone in (True, False))
     figure = Figure(figsize=(3.7, 1.9 * bool(rest or waves) + 1.3 * bool(answer.stokes)), layout="constrained")
     rows = figure.subfigures(1 + bool(answer.stokes), 1, height_ratios=[1.9, 1.3][: 1 + bool(answer.stokes)], squeeze=False)[:, 0]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 from test_cli import run
 from typer.testing import CliRunner
 
+from mmsynth.bench import jobs
 from mmsynth.cli import app
 
 pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
@@ -23,6 +26,17 @@ def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def call(*args: str) -> Any:
     """In this process: importing torch anew for every refusal takes seconds."""
     return CliRunner().invoke(app, args)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits of a bench; ``bench fit`` here and tests/bench/test_jobs.py have them in processes of their own."""
+
+    def worked(module: str, task: Mapping[str, Any], name: str) -> dict[str, Any]:
+        result: dict[str, Any] = json.loads(json.dumps(importlib.import_module(module).work(json.loads(json.dumps(task)))))
+        return result
+
+    monkeypatch.setattr(jobs, "in_a_process", worked)
 
 
 def refused(result: Any, *words: str) -> None:
@@ -44,14 +58,14 @@ def test_bench_fit_goes_on_where_it_was(tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "plot.svg", "rows"}
     (file,) = (out / "rows").iterdir()
     made = file.stat().st_mtime_ns
-    again = run(tmp_path, "bench", "fit", "example", "--budgets", "0.3s", "--modalities", "rgb,pol", "--frames", "polarization=2")
-    assert again.returncode == 0, again.stderr
+    again = call("bench", "fit", "example", "--budgets", "0.3s", "--modalities", "rgb,pol", "--frames", "polarization=2")
+    assert again.exit_code == 0, again.output
     assert "Error over time" in again.stdout and "wrote bench/fit/" in again.stdout
     assert file.stat().st_mtime_ns == made and len(list((out / "rows").iterdir())) == 1
     assert not (tmp_path / "runs").exists()
 
 
-def test_bench_ablation(tmp_path: Path) -> None:
+def test_bench_ablation(tmp_path: Path, in_this_process: None) -> None:
     (tmp_path / "table.toml").write_text('[[variant]]\nname = "both"\n[[variant]]\nname = "rgb"\nmodalities = ["rgb"]\n')
     result = call("bench", "ablation", "example", "--table", "table.toml", "--steps", "3", "--out", "here", "--json")
     assert result.exit_code == 0, result.output
@@ -61,7 +75,7 @@ def test_bench_ablation(tmp_path: Path) -> None:
     assert (tmp_path / "here" / "report.md").is_file()
 
 
-def test_bench_paper(tmp_path: Path) -> None:
+def test_bench_paper(tmp_path: Path, in_this_process: None) -> None:
     head = 'title = "Two"\nsource = "nobody"\n'
     rows = '[[row]]\nname = "both"\nmodalities = ["rgb", "pol"]\n[[row]]\nname = "one"\nmodalities = ["rgb"]\n'
     (tmp_path / "two.toml").write_text(head + rows)

@@ -19,7 +19,9 @@ import pytest
 from analytic import AnalyticField, scene_of, sphere
 from browsers import chromium, errors_of
 from test_viewer import free_port
+from typer.testing import CliRunner
 
+from mmsynth.cli import app
 from mmsynth.operations.views.load import load_views
 from mmsynth.sensors.camera import Camera
 from mmsynth.viewer.open import open_viewer
@@ -235,9 +237,12 @@ def test_two_browsers_see_their_own_cameras(browser: Any, viewer: Viewer) -> Non
     second.close()
 
 
-def test_from_a_run_to_a_dataset_on_the_command_line(browser: Any, tmp_path: Path) -> None:
-    call = lambda *args: subprocess.run([sys.executable, "-m", "mmsynth", *args], cwd=tmp_path, capture_output=True, text=True, timeout=600)
-    assert call("fit", "example", "--steps", "20", "--run", "run").returncode == 0
+@pytest.mark.usefixtures("decided_by_few_rays")
+def test_from_a_run_to_a_dataset_on_the_command_line(browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The viewer is a process of its own."""
+    monkeypatch.chdir(tmp_path)
+    call = lambda *args: CliRunner().invoke(app, args)
+    assert call("fit", "example", "--steps", "20", "--run", "run").exit_code == 0
     port = free_port()
     command = [sys.executable, "-m", "mmsynth", "view", "--run", "run", "--port", str(port)]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -267,6 +272,6 @@ def test_from_a_run_to_a_dataset_on_the_command_line(browser: Any, tmp_path: Pat
         _, said = process.communicate(timeout=60)
         assert process.returncode == 130 and said.splitlines()[-1:] == ["interrupted"] and not errors
     made = call("generate-dataset", "--run", "run", "--poses", str(poses), "--out", "data", "--json")
-    assert made.returncode == 0 and json.loads(made.stdout)["views"] == 3, made.stderr
+    assert made.exit_code == 0 and json.loads(made.stdout)["views"] == 3, made.stderr
     filmed = call("video", "--run", "run", "--poses", str(poses), "--show", "rgb,ms:5,aolp", "--json")
     assert json.loads(filmed.stdout) == {"out": "run/videos/path.mp4", "pictures": 3, "show": ["rgb", "ms:5", "pol:aolp"]}, filmed.stderr

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 
 from mmsynth.operations.conversion.moving_light import MovingLight, moving_light
 from mmsynth.operations.conversion.predictions import (
@@ -174,6 +173,8 @@ def _photosites(light: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def _bounded(gram: np.ndarray, product: np.ndarray) -> np.ndarray:
     """(K,) w ≥ 0 with Σ w ≤ 1 that minimise wᵀ G w - 2 hᵀ w."""
+    from scipy.optimize import nnls  # half a second to import
+
     count = len(product)
     root = np.linalg.cholesky(gram + (1e-6 * np.trace(gram) / count + 1e-15) * np.eye(count))
     goal = np.linalg.solve(root, product)

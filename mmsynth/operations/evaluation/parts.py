@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.ndimage import binary_dilation, maximum_filter, median_filter, minimum_filter
 
 PARTS = ("highlights", "silhouettes", "rest")
 _BRIGHTER = 0.08  # than the median around, of full scale
@@ -24,6 +23,8 @@ def parts_of(light: np.ndarray, geometry: Mapping[str, np.ndarray], labels: Mapp
             nothing is hit, and ``label`` (H, W) where it is known. labels: by number (as text), names; what is named table, board, room or
             background is no object. where: (H, W) bool, the pixels in question.
     """
+    from scipy.ndimage import binary_dilation, maximum_filter, median_filter, minimum_filter  # half a second to import
+
     depth = geometry["depth_z"]
     label = geometry.get("label", np.zeros(depth.shape, np.uint8))
     least = light.min(-1)

@@ -11,8 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from mmsynth.errors import InputError
 from mmsynth.scene.checks import number, whole
@@ -83,6 +81,8 @@ def _interpolate(views: int, poses: Sequence[np.ndarray], reach: float) -> list[
     Args:
         reach: how far away things are, in the scene's unit: what an angle in radians counts for.
     """
+    from scipy.spatial.transform import Rotation, Slerp  # half a second to import, and most poses come from files
+
     rotations, centres = Rotation.from_matrix(np.array([p[:3, :3] for p in poses])), np.array([p[:3, 3] for p in poses])
     turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.linalg.norm(np.diff(centres, axis=0), axis=1), reach * turned))])
@@ -106,6 +106,9 @@ def through(keys: Sequence[PosedCamera], views: int, reach: float) -> list[Posed
     Returns:
         ``views`` cameras, named by their number, the first and last of them the first and last key.
     """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     poses = np.stack([key.camera_to_world for key in keys])
     rotations, centres = Rotation.from_matrix(poses[:, :3, :3]), poses[:, :3, 3]
     turned = (rotations[:-1].inv() * rotations[1:]).magnitude()
@@ -134,6 +137,8 @@ def _perturb(
         rotation: standard deviation of each component of the rotation vector [rad].
         translation: of each coordinate, as a share of the pose's distance to the region's centre.
     """
+    from scipy.spatial.transform import Rotation
+
     out = []
     for index, pose in enumerate(poses):
         distance = float(np.linalg.norm(pose[:3, 3] - region.centre))
