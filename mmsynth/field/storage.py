@@ -100,7 +100,7 @@ def load_field(run: Path, device: str = "cpu") -> Field:
         raise InputError(f"{run / 'field.safetensors'}: could not be read ({str(error).splitlines()[0]}).") from error
     field.manifest = manifest
     if device == "cpu":
-        warm_up()  # a run may have been fitted on another machine
+        warm_up(learning=False)  # a run may have been fitted on another machine
     return field.to(device)
 
 

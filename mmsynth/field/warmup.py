@@ -23,19 +23,23 @@ from mmsynth.scene.scene import Sensor
 
 
 @functools.cache
-def warm_up() -> None:
+def warm_up(learning: bool = True) -> None:
     """Compile the CPU kernels of a fit if they never were, and say so, and load them, so that no timed loop does it.
 
     Processes of their own compile, half of the kernels each: in the one that did, kernels share code that was compiled for others, and its
     sums are rounded otherwise than in every later process, which loads the kernels from the cache. Where there is no cache, this process
     has to compile.
+
+    Args:
+        learning: load those of a step, too, which a field that only renders never calls.
     """
     if not cpu.is_compiled():
         print("compiling kernels once, one to two minutes ...", file=sys.stderr, flush=True)
         _compile_apart(_HALVES)
         cpu.remove_old_kernels()
-    for half in _HALVES:
-        half()
+    if learning:
+        run_steps()
+    run_operations()
 
 
 def _compile_apart(calls: Sequence[Callable[[], None]]) -> None:
