@@ -430,7 +430,7 @@ def test_a_full_disk_leaves_nothing_half_written(fitted: Path, tmp_path: Path) -
 
 
 def test_importing_sets_no_environment_variable_and_leaves_plots_and_solvers_for_later() -> None:
-    """Which took a fifth of the time until a fit's first step."""
+    """Which took a quarter of a command's imports."""
     code = """
 import os, sys, cv2, torch
 before = dict(os.environ)
