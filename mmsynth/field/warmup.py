@@ -49,7 +49,10 @@ def _compile_apart(calls: Sequence[Callable[[], None]]) -> None:
         children: list[subprocess.Popen[bytes]] = []
         try:
             for call, cache in zip(calls, caches, strict=True):
-                program = f"from mmsynth.process import set_up; set_up(); from mmsynth.field import warmup; warmup.{call.__name__}()"
+                program = (
+                    "from mmsynth.process import set_up, with_frames_in_one_block; set_up(); "
+                    f"from mmsynth.field import warmup; with_frames_in_one_block(warmup.{call.__name__})"
+                )
                 environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(cache)}
                 command = [sys.executable, "-c", program]
                 children.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))

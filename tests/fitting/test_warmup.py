@@ -51,7 +51,7 @@ class _Child:
     """In the place of a process: what was started, waited for and killed."""
 
     def __init__(self, log: list[str], command: list[str], wait: Callable[[], None]) -> None:
-        self.log, self.what, self._wait = log, command[-1].split(".")[-1], wait
+        self.log, self.what, self._wait = log, command[-1].split("warmup.")[-1].rstrip(")"), wait
         assert command[0] == sys.executable
         log.append(f"start {self.what}")
 
@@ -72,7 +72,7 @@ def test_other_processes_compile_and_this_one_loads(monkeypatch: pytest.MonkeyPa
             warmup.subprocess, "Popen", lambda command, env, **_: caches.add(env["NUMBA_CACHE_DIR"]) or _Child(log, command, lambda: None)
         )
         warmup.warm_up.__wrapped__()
-    steps, operations = "run_steps()", "run_operations()"
+    steps, operations = "run_steps", "run_operations"
     apart = [f"start {steps}", f"start {operations}", f"wait {steps}", f"wait {operations}"]
     assert log[:4] == apart and {f"kill {steps}", f"kill {operations}"} <= set(log[4:]) and len(caches) == 2
     program = (
@@ -92,11 +92,11 @@ def test_what_is_interrupted_compiles_no_more(monkeypatch: pytest.MonkeyPatch) -
     log: list[str] = []
 
     def interrupted() -> None:
-        if log.count("wait run_steps()") == 1:
+        if log.count("wait run_steps") == 1:
             raise Interrupted("stop")
 
     monkeypatch.setattr(cpu, "is_compiled", lambda: False)
     monkeypatch.setattr(warmup.subprocess, "Popen", lambda command, **_: _Child(log, command, interrupted))
     with pytest.raises(Interrupted):
         warmup.warm_up.__wrapped__()
-    assert "kill run_steps()" in log and log[-2:] == ["kill run_operations()", "wait run_operations()"]
+    assert "kill run_steps" in log and log[-2:] == ["kill run_operations", "wait run_operations"]
