@@ -6,6 +6,7 @@ import functools
 import json
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,7 @@ def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]],
         @functools.wraps(function)
         def guarded(*args: Any, **kwargs: Any) -> None:
             try:
-                with _sigterm_interrupts():
+                with _signals_interrupt():
                     function(*args, **kwargs)
             except KeyboardInterrupt as stop:
                 stop = stop if isinstance(stop, Interrupted) else Interrupted("interrupted")
@@ -51,16 +52,31 @@ def command(name: str, of: typer.Typer = app) -> Callable[[Callable[..., None]],
 
 
 @contextmanager
-def _sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM (of ``kill``, a batch system, ``docker stop``) ends a command as Ctrl-C does: what is not finished is cleared away."""
+def _signals_interrupt() -> Iterator[None]:
+    """SIGTERM (of ``kill``, a batch system, ``docker stop``) ends a command as Ctrl-C does: what is not finished is cleared away.
+
+    Neither is lost where it arrives while an object is destroyed: what is raised there Python tells and ignores, so it is sent again.
+    """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise Interrupted("terminated", number)
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    def unraisable(ignored: sys.UnraisableHookArgs) -> None:
+        if not issubclass(ignored.exc_type, KeyboardInterrupt):
+            tell(ignored)
+            return
+        number = signal.SIGTERM if issubclass(ignored.exc_type, Interrupted) else signal.SIGINT
+        # not at once: this function is called where nothing can be raised, either
+        again = threading.Timer(0.01, signal.pthread_kill, (threading.main_thread().ident, number))
+        again.daemon = True
+        again.start()
+
+    before, tell = signal.signal(signal.SIGTERM, interrupt), sys.unraisablehook
+    sys.unraisablehook = unraisable
     try:
         yield
     finally:
+        sys.unraisablehook = tell
         signal.signal(signal.SIGTERM, before)
 
 

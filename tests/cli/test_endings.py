@@ -67,6 +67,32 @@ def test_a_signal_ends_any_command(fitted: Path, monkeypatch: pytest.MonkeyPatch
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+class _Signals:
+    """A signal comes while this is destroyed, where Python ignores what is raised."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        signal.raise_signal(self.number)
+
+
+def _destroyed(number: int) -> None:
+    _Signals(number)
+    limit = time.monotonic() + 60.0
+    while time.monotonic() < limit:
+        time.sleep(0.01)
+
+
+def test_a_signal_that_comes_while_something_is_destroyed_ends_a_command(fitted: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The viewer went on after Ctrl-C: it had come while the memory of a kernel was given back."""
+    for number, code, word in ((signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")):
+        monkeypatch.setattr("mmsynth.workflows.runs.load_again", lambda *_, number=number, **__: _destroyed(number))
+        before = sys.unraisablehook
+        ends(fitted, ("evaluate",), code, word)
+        assert sys.unraisablehook is before
+
+
 def test_a_limit_of_memory(fitted: Path, tmp_path: Path) -> None:
     """The kernel refuses a process more memory than it has and 60 MB, before a scene is read."""
     code = """
@@ -75,7 +101,7 @@ from mmsynth.cli import main
 import mmsynth.workflows.fit
 from mmsynth.field.warmup import warm_up
 warm_up()
-size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() + 60_000_000
+size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() + 1.000_000
 resource.setrlimit(resource.RLIMIT_AS, (size, size))
 main()
 """

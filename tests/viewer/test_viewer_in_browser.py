@@ -246,31 +246,34 @@ def test_from_a_run_to_a_dataset_on_the_command_line(browser: Any, tmp_path: Pat
     port = free_port()
     command = [sys.executable, "-m", "mmsynth", "view", "--run", "run", "--port", str(port)]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None and process.stderr is not None
-        told = process.stdout.readline()
-        assert f"http://127.0.0.1:{port} (this machine alone can see it" in told
-        page = browser.new_page(viewport=SIZE)
-        errors = errors_of(page)
-        page.goto(f"http://127.0.0.1:{port}")
-        page.get_by_role("tab", name="Path").click(timeout=60_000)
-        press(page, "Add key pose here")
-        page.get_by_text("1 key pose.").wait_for()
-        page.mouse.move(*HERE)
-        page.mouse.down()
-        page.mouse.move(HERE[0] + 60, HERE[1], steps=4)
-        page.mouse.up()
-        page.wait_for_timeout(500)
-        press(page, "Add key pose here")
-        fill(page, "Pictures a second", "1")
-        fill(page, "Seconds", "3")
-        fill(page, "Width [px]", "32")
-        press(page, "Save poses")
-        poses = tmp_path / "run" / "paths" / "path.json"
-        until(poses.is_file, "the poses")
-        page.close()
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-        assert process.returncode == 130 and said.splitlines()[-1:] == ["interrupted"] and not errors
+        try:
+            assert process.stdout is not None and process.stderr is not None
+            told = process.stdout.readline()
+            assert f"http://127.0.0.1:{port} (this machine alone can see it" in told
+            page = browser.new_page(viewport=SIZE)
+            errors = errors_of(page)
+            page.goto(f"http://127.0.0.1:{port}")
+            page.get_by_role("tab", name="Path").click(timeout=60_000)
+            press(page, "Add key pose here")
+            page.get_by_text("1 key pose.").wait_for()
+            page.mouse.move(*HERE)
+            page.mouse.down()
+            page.mouse.move(HERE[0] + 60, HERE[1], steps=4)
+            page.mouse.up()
+            page.wait_for_timeout(500)
+            press(page, "Add key pose here")
+            fill(page, "Pictures a second", "1")
+            fill(page, "Seconds", "3")
+            fill(page, "Width [px]", "32")
+            press(page, "Save poses")
+            poses = tmp_path / "run" / "paths" / "path.json"
+            until(poses.is_file, "the poses")
+            page.close()
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+            assert process.returncode == 130 and said.splitlines()[-1:] == ["interrupted"] and not errors
+        finally:  # a test that failed would wait for it
+            process.kill()
     made = call("generate-dataset", "--run", "run", "--poses", str(poses), "--out", "data", "--json")
     assert made.exit_code == 0 and json.loads(made.stdout)["views"] == 3, made.stderr
     filmed = call("video", "--run", "run", "--poses", str(poses), "--show", "rgb,ms:5,aolp", "--json")
