@@ -101,7 +101,7 @@ from mmsynth.cli import main
 import mmsynth.workflows.fit
 from mmsynth.field.warmup import warm_up
 warm_up()
-size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() + 1.000_000
+size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() + 60_000_000
 resource.setrlimit(resource.RLIMIT_AS, (size, size))
 main()
 """
