@@ -103,6 +103,13 @@ def settled(page: Any) -> None:
     page.evaluate("() => new Promise(done => setTimeout(done, 200))")
 
 
+def drag(page: Any, right: int, down: int = 0) -> None:
+    page.mouse.move(*HERE)
+    page.mouse.down()
+    page.mouse.move(HERE[0] + right, HERE[1] + down, steps=5)
+    page.mouse.up()
+
+
 def press(page: Any, name: str) -> None:
     page.get_by_role("button", name=name).click()
     settled(page)
@@ -123,10 +130,7 @@ def test_a_drag_and_a_choice_change_the_picture(browser: Any, viewer: Viewer) ->
     page = opened(browser, viewer)
     first = shot(page)
     assert first.std() > 5.0  # the sphere's shade
-    page.mouse.move(*HERE)
-    page.mouse.down()
-    page.mouse.move(HERE[0] + 80, HERE[1] + 20, steps=6)
-    page.mouse.up()
+    drag(page, 80, 20)
     page.wait_for_timeout(300)
     rest(page, viewer)
     turned = shot(page)
@@ -188,10 +192,7 @@ def test_a_path_is_saved_flown_and_filmed_within_the_run(browser: Any, viewer: V
     page.get_by_text("it takes two key poses").wait_for()
     press(page, "Add key pose here")
     page.get_by_text("1 key pose.").wait_for()
-    page.mouse.move(*HERE)
-    page.mouse.down()
-    page.mouse.move(HERE[0] + 60, HERE[1], steps=4)
-    page.mouse.up()
+    drag(page, 60)
     rest(page, viewer)
     press(page, "Add key pose here")
     page.get_by_text("2 key poses.").wait_for()
@@ -225,10 +226,7 @@ def test_two_browsers_see_their_own_cameras(browser: Any, viewer: Viewer) -> Non
     first, second = opened(browser, viewer), opened(browser, viewer)
     until(lambda: len(viewer.sessions) == 2, "both")
     before, still = shot(first), shot(second)
-    first.mouse.move(*HERE)
-    first.mouse.down()
-    first.mouse.move(HERE[0] + 80, HERE[1], steps=4)
-    first.mouse.up()
+    drag(first, 80)
     rest(first, viewer)
     assert np.abs(shot(first) - before).mean() > 1.0
     assert np.abs(shot(second) - still).mean() < 0.5
@@ -256,10 +254,7 @@ def test_from_a_run_to_a_dataset_on_the_command_line(browser: Any, tmp_path: Pat
             page.get_by_role("tab", name="Path").click(timeout=60_000)
             press(page, "Add key pose here")
             page.get_by_text("1 key pose.").wait_for()
-            page.mouse.move(*HERE)
-            page.mouse.down()
-            page.mouse.move(HERE[0] + 60, HERE[1], steps=4)
-            page.mouse.up()
+            drag(page, 60)
             page.wait_for_timeout(500)
             press(page, "Add key pose here")
             fill(page, "Pictures a second", "1")
