@@ -1,4 +1,4 @@
-"""What a process of our own sets before it imports torch; a library leaves both to the program that it is in."""
+"""What processes of our own do for the interpreter they run in; a library leaves that to the program that it is in."""
 
 import gc
 import os
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 
 def set_up() -> None:
-    """Short spins at barriers, and garbage looked for a fourteenth as often as by default."""
+    """Before torch is imported: short spins at barriers, and garbage looked for a fourteenth as often as by default."""
     # OpenMP's threads spin for milliseconds at every barrier by default, which stalls a fit beside another busy process. A short spin
     # costs nothing alone and was 1.6 times as fast beside one. Read when torch is loaded; a user's own setting stays.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
