@@ -3,17 +3,60 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
-from numba import njit
+from numba import _dynfunc, njit
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.typed_passes import NativeLowering
+
+
+class _OnlyLinked(JITCodeLibrary):
+    """A part for LLVM. The modules of kernels that call it take it in, optimise it there and make its machine code with their own."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _PartLowering(NativeLowering):
+    """As numba's own, without machine code of the part, which would never be called."""
+
+    _name = "lowering_of_a_part"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _OnlyLinked(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.flags.no_compile = True
+        super().run_pass(state)
+        lowered = state["cr"]
+        # numba knows what is called by what Python would call
+        for_python = _dynfunc.make_function(lowered.fndesc.lookup_module(), lowered.fndesc.qualname, "", 0, lowered.env, (state.library,))
+        state.targetctx.insert_user_function(for_python, lowered.fndesc, [state.library])
+        state["cr"] = lowered._replace(cfunc=for_python)
+        return True
+
+
+class _PartCompiler(CompilerBase):
+    def define_pipelines(self) -> list[PassManager]:
+        passes = PassManager("part of a kernel")
+        for each, what in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            passes.add_pass(_PartLowering if each is NativeLowering else each, what)
+        passes.finalize()
+        return [passes]
+
 
 _common = functools.partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 # called from Python; its code is kept on disk, with that of all that it calls
 kernel = functools.partial(_common, cache=True)
 
-# called from kernels alone: without the code that takes arguments from Python, a tenth of the time to compile. Python that calls one all
-# the same ends in a crash (tests: ``from_python``)
-part = functools.partial(_common, no_cpython_wrapper=True)
+# called from kernels alone: without machine code of its own and the code that takes arguments from Python, which were a third of the time
+# to compile. Python that calls one all the same ends in a crash (tests: ``from_python``)
+part = functools.partial(_common, no_cpython_wrapper=True, pipeline_class=_PartCompiler)
 
 # put into what calls it before types are known
 inlined = functools.partial(njit, inline="always", error_model="numpy")
