@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.scene.capture.aruco import detect_markers
 from mmsynth.scene.capture.triangulation import Sighting, nearest_point, reprojection_error
 from mmsynth.scene.images import read_image
 from mmsynth.scene.scene import Frame
@@ -72,14 +73,13 @@ def markers_in(grey: np.ndarray) -> dict[Corner, np.ndarray]:
     small = cv2.resize((255 * level).astype(np.uint8), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     out: dict[Corner, np.ndarray] = {}
     twice: set[Corner] = set()
-    for name in _DICTIONARIES:
-        found, ids, _ = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(name)).detectMarkers(small)
-        for corners, marker in zip(found, [] if ids is None else np.ravel(ids), strict=True):
-            for k, place in enumerate(corners[0]):
-                corner = (name, int(marker), k)
+    for name, found in zip(_DICTIONARIES, detect_markers(small, _DICTIONARIES), strict=True):
+        for marker, corners in found:
+            for k, place in enumerate(corners):
+                corner = (name, marker, k)
                 twice |= {corner} & out.keys()
                 # OpenCV resizes about the pictures' corners: pixel centres are at +0.5
-                out[corner] = (place.astype(np.float64) + 0.5) / scale - 0.5
+                out[corner] = (place + 0.5) / scale - 0.5
     return {corner: place for corner, place in out.items() if corner not in twice}
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from mmsynth.errors import InputError
 from mmsynth.scene.capture.adjustment import Adjusted, View
+from mmsynth.scene.capture.aruco import detect_markers
 from mmsynth.scene.capture.board import Board
 from mmsynth.scene.capture.board_frames import SensorFrames
 from mmsynth.scene.capture.detection import find_boards, level_channels
@@ -72,11 +73,9 @@ def _other_size(raw: np.ndarray, sensor: SensorFrames, board: Board) -> str | No
             if sorted((rows, columns)) != sorted(board.squares):
                 return f"a chessboard of {columns}x{rows} squares, expected {board.squares[0]}x{board.squares[1]} as board.toml states"
     if board.kind == "charuco":
-        counts: dict[str, list[int]] = {}
-        for name in (n for n in dir(cv2.aruco) if n.startswith("DICT_") and n.endswith(("1000", "ORIGINAL"))):
-            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-            found_ids = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]
-            counts[name] = [] if found_ids is None else sorted(int(i) for i in np.ravel(found_ids))
+        names = [n for n in dir(cv2.aruco) if n.startswith("DICT_") and n.endswith(("1000", "ORIGINAL"))]
+        found_in = detect_markers(picture, [getattr(cv2.aruco, name) for name in names])
+        counts = {name: sorted(marker for marker, _ in found) for name, found in zip(names, found_in, strict=True)}
         name = max(counts, key=lambda n: len(counts[n]))
         if len(counts[name]) >= 4:
             ids, last = counts[name], board.first_id + board.squares[0] * board.squares[1] // 2 - 1
