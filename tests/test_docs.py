@@ -159,6 +159,7 @@ def test_python_blocks(name: str, mark: str, block: str) -> None:
         exec(code, {})
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_ten_lines_of_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As printed, but for the scene, and lengths and sizes that a test can wait for."""
     (block,) = [block for name, _, block in python_blocks() if name.startswith("README.md")]

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from mmsynth.bench.machine import describe
 from mmsynth.bench.tables import Table, markdown
-from mmsynth.files import write_atomic, write_json, write_text
+from mmsynth.files import write_json, write_text
 from mmsynth.report.page import links_to, svg, write_page
 
 _FILES = (("results.json", "all numbers"), ("report.md", "the tables as Markdown"), ("plot.svg", "the plot"), ("rows/*.json", "one row"))
@@ -52,14 +51,15 @@ def write_report(results: dict[str, Any], tables: Sequence[Table], figure: Figur
     title = f"# mmsynth bench {results['bench']}\n\n{describe(results['machine'])}\n"
     plot = [] if figure is None else ["![plot](plot.svg)", ""]
     write_text(out / "report.md", "\n".join([title, *map(markdown, tables), *plot]))
-    if figure is not None:
-        write_atomic(out / "plot.svg", lambda path: FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None}))
+    drawn = None if figure is None else svg(figure)
+    if drawn is not None:
+        write_text(out / "plot.svg", drawn)
     write_json(out / "results.json", results)
     page = {
         "title": f"mmsynth bench {results['bench']}",
         "subtitle": describe(results["machine"]),
         "tables": [(one.title, [c.heading for c in one.filled()], _cells(one), one.note) for one in tables],
-        "plot": None if figure is None else svg(figure),
+        "plot": drawn,
         "files": links_to(out, _FILES),
     }
     write_page(out / "report.html", _BODY, page)

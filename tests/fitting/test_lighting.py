@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few_looks import few_looks
 
 from mmsynth.field.storage import load_field
 from mmsynth.fitting import candidates
@@ -77,9 +78,12 @@ def test_a_field_that_decided_against_lamps_forgets_them(scene: Scene, tmp_path:
 
 
 @pytest.mark.parametrize("stop", [10, 15, 30])  # before lamps are sought, in their trial, and after it
-@pytest.mark.parametrize("least", [0.0, 1.0])
-def test_a_fit_resumes_to_the_same_lamps(scene: Scene, stop: int, least: float) -> None:
-    recipe = SMALL.with_changes({"radiance.light_min_improvement": least})
+@pytest.mark.parametrize(("changes", "kept"), [({"radiance.light": "on"}, True), ({"radiance.light_min_improvement": 1.0}, False)])
+def test_a_fit_resumes_to_the_same_lamps(
+    scene: Scene, stop: int, changes: dict[str, Any], kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few_looks(monkeypatch, rays=512)
+    recipe = SMALL.with_changes(changes)
     first, second = (Trainer(scene, recipe, 40, None, 0, "cpu") for _ in range(2))
     for step in range(36):
         if step == stop:
@@ -90,6 +94,7 @@ def test_a_fit_resumes_to_the_same_lamps(scene: Scene, stop: int, least: float) 
         second.run_step()
     expected, found = first.field.state_dict(), second.field.state_dict()
     assert list(expected) == list(found) and all(torch.equal(expected[name], found[name]) for name in expected)
+    assert first.state.light is not None and first.state.light.value == kept
 
 
 def test_lamps_stand_beyond_the_cameras(scene: Scene) -> None:

@@ -152,6 +152,7 @@ def test_a_sensor_without_masks_of_the_object_learns_colours_alone(tmp_path: Pat
     assert "mono without masks: learned from the geometry of the others" in needs.choices["masks"].why
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_an_object_is_found_by_its_outlines(tmp_path: Path) -> None:
     """The ball whose outline the masks are; nothing else tells it from its background, which has its colour."""
     scene = _scene(tmp_path, "object", outside=0.4)
@@ -165,6 +166,7 @@ def test_an_object_is_found_by_its_outlines(tmp_path: Path) -> None:
     assert field.manifest["scene"]["masks"] == "object"
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_fields_of_an_object_do_not_depend_on_colours_outside(tmp_path: Path) -> None:
     one, other = (_trained(_scene(tmp_path / str(k), "object", outside), 20).field.state_dict() for k, outside in enumerate((1.0, 0.1)))
     assert all(torch.equal(one[name], other[name]) for name in one)

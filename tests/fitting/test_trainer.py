@@ -122,6 +122,7 @@ def test_a_fit_learns_and_its_run_gives_the_same_field_back(scene: Scene, tmp_pa
     assert field.manifest["skipped_steps"] == 0 and field.manifest["steps"] == 300
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fit_with_a_background_learns_too(tmp_path: Path) -> None:
     """A sky whose colour is that of the direction, and a grey ball before it."""
 
@@ -369,6 +370,7 @@ def test_length_is_steps_or_time(scene: Scene) -> None:
             Trainer(scene, SMALL, steps, budget, 0, "cpu")
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("grown", [1.0, 9.0])
 def test_the_number_of_rays_follows_the_samples(scene: Scene, grown: float) -> None:
     trainer = _trainer(scene, 80, **{"sampling.occupancy_every": 4, "sampling.samples_growth": grown})

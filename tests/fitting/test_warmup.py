@@ -35,6 +35,7 @@ def _signatures() -> dict[str, list[object]]:
     return {f"{m.__name__}.{n}": list(x.signatures) for m in modules for n, x in vars(m).items() if isinstance(x, Dispatcher)}
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fit_compiles_nothing_after_it_began(tmp_path: Path) -> None:
     """Nor loads from the cache: pose evidence, the probe, sized tables, exposure and rendering with normals meet what was warmed up."""
     warm_up()

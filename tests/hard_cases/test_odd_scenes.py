@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few_looks import few_looks
 from skimage.metrics import structural_similarity
 from small_scenes import FOCAL, HEIGHT, QUICK, RADIUS, WIDTH, around, look_from, picture, write_scene
 
@@ -190,6 +191,7 @@ def test_a_modality_that_is_clipped_throughout(row: Row, tmp_path: Path) -> None
     )
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_modality_with_one_frame(row: Row, tmp_path: Path) -> None:
     """The frame does not stand where its pose says: it sees the ball half as large. What do test views of the others lose by it?"""
     poses = {"rgb": around(12), "mono": around(12)[1:2]}
@@ -235,9 +237,12 @@ def _between_planes(scene: Scene, scale: float) -> float:
 @pytest.fixture(scope="module")
 def in_metres(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Field]:
     folder = tmp_path_factory.mktemp("plain")
-    return folder / "scene", _fit(folder, {"rgb": around(6)})
+    with pytest.MonkeyPatch.context() as patch:
+        few_looks(patch)
+        return folder / "scene", _fit(folder, {"rgb": around(6)})
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("scale", [2.0**10, 2.0**-10, 1000.0, 1e-3, 1e6])
 def test_scenes_in_any_unit(row: Row, tmp_path: Path, in_metres: tuple[Path, Field], scale: float) -> None:
     """In millimetres or in kilometres: the same fit. To the last bit where the factor is a power of two."""
@@ -292,6 +297,7 @@ def test_cameras_inside_the_region(row: Row, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fisheye_that_sees_beside_itself(row: Row, tmp_path: Path) -> None:
     """220 degrees across: half of its picture has no pinhole. The ball fills the middle."""
     near = around(8, 1.4)
