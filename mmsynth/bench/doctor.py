@@ -55,6 +55,7 @@ def diagnose() -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "gpu": gpu,
         "kernels_compiled": compiled,
+        "kernels_in": str(cpu.kept_in()),
         "advice": advice,
     }
 
@@ -63,5 +64,5 @@ def render_text(facts: dict[str, Any]) -> str:
     """The facts as lines of text."""
     lines = [f"python {facts['python']}, {facts['cores']} cores, {facts['threads']} threads, GPU: {facts['gpu'] or 'none'}"]
     lines += [f"  {name} {version or 'not installed'}" for name, version in facts["versions"].items()]
-    lines.append(f"CPU kernels compiled: {'yes' if facts['kernels_compiled'] else 'no'}")
+    lines.append(f"CPU kernels compiled: {'yes, in ' + facts['kernels_in'] if facts['kernels_compiled'] else 'no'}")
     return "\n".join(lines + facts["advice"])

@@ -23,6 +23,7 @@ The gradients of the inverses are those of the implicit function theorem: one Ne
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -79,8 +80,17 @@ def distort_jacobian(xy: Tensor, k: Tensor) -> Tensor:
 
 def fold_radius(k: Tensor) -> Tensor:
     """Ideal radius up to which the radial profile of Brown-Conrady lenses rises, (..., 8) → (...); at most tan 80°, ∞ of a pinhole."""
-    k = k.detach()
+    if k.ndim == 1 and k.device.type == "cpu":  # each tile of a picture asks for its camera's
+        return _fold_radius_of_one(tuple(k.tolist()), k.dtype)
+    return _fold_radius(k.detach())
 
+
+@functools.lru_cache(maxsize=256)
+def _fold_radius_of_one(k: tuple[float, ...], dtype: torch.dtype) -> Tensor:
+    return _fold_radius(torch.tensor(k, dtype=dtype))
+
+
+def _fold_radius(k: Tensor) -> Tensor:
     def slope(angle: Tensor) -> Tensor:
         r2 = torch.tan(angle) ** 2
         radial, d = _radial(r2, k[..., None, :])

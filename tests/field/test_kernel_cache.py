@@ -6,11 +6,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numba
 import pytest
 
 from mmsynth.field.kernels.cpu import KERNELS, caching
+
+SOURCES = Path(caching.__file__).parent
 
 
 def _folder(path: Path) -> Path:
@@ -30,33 +33,60 @@ def test_a_change_of_any_source_is_another_version(tmp_path: Path, changed: str)
     assert caching.version_of_sources(folder) != before
 
 
-def test_each_version_has_its_folder_and_other_code_keeps_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = _folder(tmp_path)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
-    with caching.kept_by_version(folder):
-        beside = Path(numba.config.CACHE_DIR)
-    assert beside == folder / "__pycache__" / f"kernels-{caching.version_of_sources(folder)}"
-    assert numba.config.CACHE_DIR == ""
+def test_each_version_has_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"kernels-{caching.version_of_sources(SOURCES)}"
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "mine"))
-    with caching.kept_by_version(folder):
-        assert Path(numba.config.CACHE_DIR).parent == tmp_path / "mine"
+    assert caching.kept_in() == tmp_path / "mine" / name
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(caching, "AppDirs", lambda _: SimpleNamespace(user_cache_dir=str(tmp_path / "user")))
+    assert caching.kept_in() == tmp_path / "user" / name and caching.kept_in().is_dir()
     monkeypatch.setattr(caching.os, "access", lambda *_: False)
-    with caching.kept_by_version(folder):
-        assert tmp_path not in Path(numba.config.CACHE_DIR).parents and "mmsynth" in numba.config.CACHE_DIR
+    assert caching.kept_in() == SOURCES / "__pycache__" / name
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(caching, "AppDirs", lambda _: SimpleNamespace(user_cache_dir=str(tmp_path / "file")))
+    assert caching.kept_in() == SOURCES / "__pycache__" / name
+
+
+@pytest.mark.parametrize("other", ["numba", "processor"])
+def test_another_compiler_or_processor_is_another_version(other: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = caching.version_of_sources(SOURCES)
+    if other == "numba":
+        monkeypatch.setattr(caching.numba, "__version__", "0.0")
+    else:
+        monkeypatch.setattr(caching, "get_host_cpu_name", lambda: "8086")
+    assert caching.version_of_sources(SOURCES) != before
+
+
+def test_checkouts_that_hold_the_same_share_what_one_has_compiled(tmp_path: Path) -> None:
+    """A kernel in two folders: numba's own cache keeps them apart."""
+
+    def result(folder: str) -> list[str]:
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "program.py").write_text(
+            "from mmsynth.field.kernels.cpu.jit import kernel\n"
+            "@kernel()\ndef outer(x): return x + 1\n"
+            "print(outer(1), sum(outer.stats.cache_hits.values()))\n"
+        )
+        variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+        run = subprocess.run(
+            [sys.executable, str(tmp_path / folder / "program.py")], env=variables, capture_output=True, text=True, check=True
+        )
+        return run.stdout.split()
+
+    assert result("one") == ["2", "0"] and result("other") == ["2", "1"]
 
 
 def test_the_last_versions_are_kept(tmp_path: Path) -> None:
-    for age, name in enumerate(("kernels-now", "kernels-a", "kernels-b", "kernels-c", "other")):
+    names = [f"kernels-{i}" for i in range(10)]
+    for age, name in enumerate((*names, "other")):
         (tmp_path / name / "cpu").mkdir(parents=True)
         os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
-    caching.remove_old_versions(tmp_path / "kernels-now")
-    assert {path.name for path in tmp_path.iterdir()} == {"kernels-now", "kernels-a", "kernels-b", "other"}
+    caching.remove_old_versions(tmp_path / "kernels-9")
+    assert {path.name for path in tmp_path.iterdir()} == {*names[:7], "kernels-9", "other"}
 
 
 def test_the_kernels_are_kept_by_version() -> None:
-    version = caching.version_of_sources(Path(caching.__file__).parent)
-    assert all(Path(kernel._cache._cache_path).parent.name == f"kernels-{version}" for kernel in KERNELS)
+    assert all(Path(kernel._cache._cache_path) == caching.kept_in() for kernel in KERNELS)
 
 
 def test_what_was_compiled_apart_is_put_where_it_is_looked_for(tmp_path: Path) -> None:

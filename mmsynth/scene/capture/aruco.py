@@ -31,8 +31,8 @@ def _detect(picture: np.ndarray, quadrilaterals: np.ndarray, dictionary: int) ->
         return []
     few = cv2.aruco.Dictionary(whole.bytesList[likely], whole.markerSize, whole.maxCorrectionBits)
     corners, numbers, _ = cv2.aruco.ArucoDetector(few).detectMarkers(picture)
-    found = [] if numbers is None else np.ravel(numbers)
-    return [(int(likely[i]), np.reshape(four, (4, 2)).astype(np.float64)) for i, four in zip(found, corners, strict=True)]
+    ids = [] if numbers is None else likely[np.ravel(numbers)].tolist()
+    return [(marker, np.reshape(four, (4, 2)).astype(np.float64)) for marker, four in zip(ids, corners, strict=True)]
 
 
 def _quadrilaterals(picture: np.ndarray) -> np.ndarray:

@@ -37,12 +37,12 @@ def keep_compiled(folder: Path) -> None:
     """Put kernels that a process compiled with a folder of its own as numba's cache where they are looked for."""
     for kernel in KERNELS:
         kept = Path(kernel._cache._cache_path)
-        publish(folder / kept.parent.name / kept.name, kept, Path(kernel._cache._cache_file._index_name).stem)
+        publish(folder / kept.name, kept, Path(kernel._cache._cache_file._index_name).stem)
 
 
 def remove_old_kernels() -> None:
     """Of versions before the last few."""
-    remove_old_versions(Path(KERNELS[0]._cache._cache_path).parent)
+    remove_old_versions(Path(KERNELS[0]._cache._cache_path))
 
 
 def _cached(kernel: Any) -> bool:

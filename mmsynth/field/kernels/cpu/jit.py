@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 from numba import _dynfunc, njit
@@ -10,6 +11,8 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.typed_passes import NativeLowering
+
+from mmsynth.field.kernels.cpu.caching import KernelCache
 
 
 class _OnlyLinked(JITCodeLibrary):
@@ -51,8 +54,17 @@ class _PartCompiler(CompilerBase):
 
 _common = functools.partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
-# called from Python; its code is kept on disk, with that of all that it calls
-kernel = functools.partial(_common, cache=True)
+
+def kernel() -> Callable[[Callable[..., Any]], Any]:
+    """What Python calls; its code is kept on disk, with that of all that it calls."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        out = _common(function)
+        out._cache = KernelCache(function)
+        return out
+
+    return compiled
+
 
 # called from kernels alone: without machine code of its own and the code that takes arguments from Python, which were a third of the time
 # to compile. Python that calls one all the same ends in a crash (tests: ``from_python``)
