@@ -6,6 +6,7 @@ expected variation around), or, with a probability that is fitted too, wider: ed
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from typing import Literal
@@ -15,6 +16,7 @@ from scipy.optimize import minimize
 from scipy.special import log_ndtr
 
 QUANTISATION = 1.0 / 12.0
+_LOG_2PI = float(np.log(2.0 * np.pi))
 _AT_ONCE = 1 << 14  # values: what is made of them stays in the cache
 
 Name = Literal["constant", "slope", "square", "variation", "outliers"]
@@ -88,6 +90,19 @@ class Values:
     region: np.ndarray
     frame: np.ndarray
 
+    @functools.cached_property
+    def square(self) -> np.ndarray:
+        return np.asarray(self.value**2)
+
+    @functools.cached_property
+    def mean_square(self) -> np.ndarray:
+        return np.asarray(self.mean**2)
+
+    @functools.cached_property
+    def cut(self) -> np.ndarray:
+        """Which were cut off."""
+        return np.flatnonzero(np.isfinite(self.bound))
+
     def __getitem__(self, chosen: np.ndarray | slice) -> Values:
         return Values(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
@@ -99,9 +114,10 @@ def outlier_variance(p: Parameters, d: Values, before: OutlierVariance) -> Outli
     if before == TEXTURE:
         far = whole & (d.value**2 > 36.0 * variance)
         return OutlierVariance(1.0, float(np.mean(d.value[far] ** 2))) if far.sum() >= 10 else TEXTURE
-    unexpected = p.outlier_probability
-    narrow = np.log1p(-unexpected) + _log_density(d, variance)[0]
-    likely = 1.0 / (1.0 + np.exp(np.clip(narrow - np.log(unexpected) - _log_density(d, variance + before.plus)[0], -50.0, 50.0)))
+    unexpected, broader = p.outlier_probability, variance + before.plus
+    narrow, broad = (_log_density(d, v, np.log(v))[0] for v in (variance, broader))
+    odds = narrow + np.log1p(-unexpected) - np.log(unexpected) - broad
+    likely = 1.0 / (1.0 + np.exp(np.clip(odds, -50.0, 50.0)))
     return OutlierVariance(1.0, float(np.average((d.value**2 - variance)[whole], weights=likely[whole])))
 
 
@@ -110,28 +126,36 @@ def _log_likelihood(p: Parameters, d: Values, factor: int, wide: OutlierVariance
     constant, gain, square, share = np.exp([p.constant, p.slope, p.square, p.variation])
     terms = np.empty((4, len(d.mean)))
     terms[0] = factor * constant
-    for row, scale, what in ((1, factor * gain, d.mean), (2, factor * square, d.mean**2), (3, share, d.activity)):
+    for row, scale, what in ((1, factor * gain, d.mean), (2, factor * square, d.mean_square), (3, share, d.activity)):
         np.multiply(what, scale, out=terms[row])
     variance = terms.sum(0) + factor * QUANTISATION
+    logarithm = np.log(variance)
     unexpected = p.outlier_probability
-    narrow, narrow_slope = _log_density(d, variance)
-    broad, broad_slope = _log_density(d, wide.times * variance + wide.plus)
+    narrow, narrow_slope = _log_density(d, variance, logarithm)
+    broader = wide.times * variance + wide.plus
+    broad, broad_slope = _log_density(d, broader, np.log(broader) if wide.plus else logarithm + np.log(wide.times))
     odds = broad - narrow + (np.log(unexpected) - np.log1p(-unexpected))  # logarithm, of an outlier
     less = np.exp(-np.abs(odds))
-    likelihood = narrow + np.log1p(-unexpected) + np.maximum(odds, 0.0) + np.log1p(less)
-    of_broad = np.where(odds > 0.0, 1.0, less) / (1.0 + less)
+    both = 1.0 + less
+    likelihood = narrow + np.log1p(-unexpected) + np.maximum(odds, 0.0) + np.log(both)
+    of_broad = np.where(odds > 0.0, 1.0, less) / both
     by_variance = narrow_slope + of_broad * (wide.times * broad_slope - narrow_slope)
     return likelihood, by_variance, of_broad - unexpected, terms
 
 
-def _log_density(d: Values, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of normal values, and of those that were cut off the probability of that; and its derivative by the variance."""
-    z = d.value**2 / variance
-    density, slope = -0.5 * z - 0.5 * np.log(2.0 * np.pi * variance), 0.5 * (z - 1.0) / variance
-    cut = np.flatnonzero(np.isfinite(d.bound))
-    at, v = d.bound[cut] / np.sqrt(variance[cut]), variance[cut]
-    density[cut] = log_ndtr(at)
-    slope[cut] = -0.5 * at / v * np.exp(-0.5 * at**2 - 0.5 * np.log(2.0 * np.pi) - density[cut])
+def _log_density(d: Values, variance: np.ndarray, logarithm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of normal values, and of those that were cut off the probability of that; and its derivative by the variance.
+
+    Args:
+        logarithm: of the variance.
+    """
+    z = d.square / variance
+    density, slope = -0.5 * (z + logarithm + _LOG_2PI), 0.5 * (z - 1.0) / variance
+    if len(d.cut):
+        v = variance[d.cut]
+        at = d.bound[d.cut] / np.sqrt(v)
+        density[d.cut] = log_ndtr(at)
+        slope[d.cut] = -0.5 * at / v * np.exp(-0.5 * (at**2 + _LOG_2PI) - density[d.cut])
     return density, slope
 
 
