@@ -112,13 +112,13 @@ def outlier_variance(p: Parameters, d: Values, before: OutlierVariance) -> Outli
     whole = ~np.isfinite(d.bound)
     variance = p.variance(d.mean)
     if before == TEXTURE:
-        far = whole & (d.value**2 > 36.0 * variance)
-        return OutlierVariance(1.0, float(np.mean(d.value[far] ** 2))) if far.sum() >= 10 else TEXTURE
+        far = whole & (d.square > 36.0 * variance)
+        return OutlierVariance(1.0, float(np.mean(d.square[far]))) if far.sum() >= 10 else TEXTURE
     unexpected, broader = p.outlier_probability, variance + before.plus
     narrow, broad = (_log_density(d, v, np.log(v))[0] for v in (variance, broader))
     odds = narrow + np.log1p(-unexpected) - np.log(unexpected) - broad
     likely = 1.0 / (1.0 + np.exp(np.clip(odds, -50.0, 50.0)))
-    return OutlierVariance(1.0, float(np.average((d.value**2 - variance)[whole], weights=likely[whole])))
+    return OutlierVariance(1.0, float(np.average((d.square - variance)[whole], weights=likely[whole])))
 
 
 def _log_likelihood(p: Parameters, d: Values, factor: int, wide: OutlierVariance) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

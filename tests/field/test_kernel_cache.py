@@ -64,7 +64,7 @@ def test_checkouts_that_hold_the_same_share_what_one_has_compiled(tmp_path: Path
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "program.py").write_text(
             "from mmsynth.field.kernels.cpu.jit import kernel\n"
-            "@kernel()\ndef outer(x): return x + 1\n"
+            "@kernel\ndef outer(x): return x + 1\n"
             "print(outer(1), sum(outer.stats.cache_hits.values()))\n"
         )
         variables = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -129,7 +129,7 @@ def surface_layers(network: Any) -> SurfaceLayers:
     return SurfaceLayers(hidden, turned, output, network.inner_radius, network.outer_radius)
 
 
-@kernel()
+@kernel
 def surface_weights(hidden, output):  # type: ignore[no-untyped-def]
     """The arrays of ``SurfaceLayers``."""
     units, tiles = hidden.shape[0], padded(hidden, FIRST_FEATURE_ROW)

@@ -7,6 +7,7 @@ same could share it: here they do.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -43,14 +44,13 @@ def _version() -> str:
 def kept_in() -> Path:
     """The folder of this version: in numba's own cache folder if one is set, with the user's caches, or where nothing may be written there,
     beside the sources."""
+    name = f"kernels-{_version()}"
     if config.CACHE_DIR:
-        return Path(config.CACHE_DIR) / f"kernels-{_version()}"
-    with_others = Path(AppDirs("mmsynth").user_cache_dir) / f"kernels-{_version()}"
-    try:
+        return Path(config.CACHE_DIR) / name
+    with_others = Path(AppDirs("mmsynth").user_cache_dir) / name
+    with contextlib.suppress(OSError):
         with_others.mkdir(parents=True, exist_ok=True)
-        return with_others if os.access(with_others, os.W_OK) else _SOURCES / "__pycache__" / with_others.name
-    except OSError:
-        return _SOURCES / "__pycache__" / with_others.name
+    return with_others if os.access(with_others, os.W_OK) else _SOURCES / "__pycache__" / name
 
 
 class _ByVersion(_CacheLocator):

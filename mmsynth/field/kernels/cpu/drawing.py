@@ -198,7 +198,7 @@ def draw_chunk(chunk, to_fill):  # type: ignore[no-untyped-def]
                 output[number] += channel
 
 
-@kernel()
+@kernel
 def draw_rays(next_task, to_fill):  # type: ignore[no-untyped-def]
     """Fills what is drawn."""
     chunk = take(next_task, 0)
@@ -207,7 +207,7 @@ def draw_rays(next_task, to_fill):  # type: ignore[no-untyped-def]
         chunk = take(next_task, 0)
 
 
-@kernel()
+@kernel
 def fill_odds(residual, count, first_tile, evenly, ends, weight):  # type: ignore[no-untyped-def]
     """See ``drawing.odds``; ``evenly``: float64. By one thread: others learn meanwhile."""
     for n in range(first_tile.shape[0] - 1):

@@ -55,15 +55,11 @@ class _PartCompiler(CompilerBase):
 _common = functools.partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def kernel() -> Callable[[Callable[..., Any]], Any]:
+def kernel(function: Callable[..., Any]) -> Any:
     """What Python calls; its code is kept on disk, with that of all that it calls."""
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        out = _common(function)
-        out._cache = KernelCache(function)
-        return out
-
-    return compiled
+    out = _common(function)
+    out._cache = KernelCache(function)
+    return out
 
 
 # called from kernels alone: without machine code of its own and the code that takes arguments from Python, which were a third of the time

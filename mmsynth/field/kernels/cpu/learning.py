@@ -172,7 +172,7 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
     return n
 
 
-@kernel()
+@kernel
 def learn_rays(  # type: ignore[no-untyped-def]
     next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured, gain,
     opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
@@ -250,7 +250,7 @@ def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, g
     return total
 
 
-@kernel()
+@kernel
 def finish(  # type: ignore[no-untyped-def]
     next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients, sums,
     places, numbers,

@@ -319,7 +319,7 @@ def composite(begin, count, slot, sections, appearance, store, features, distanc
                 features[which, begin + i, j] *= scale
 
 
-@kernel()
+@kernel
 def trace_forward(next_task, rays, states, sampling, grid, layers, appearance, keep, store, out):  # type: ignore[no-untyped-def]
     """See ``reference.trace``. store: ``RayStore``, a slot per chunk when ``keep``, else per thread. out: ``TraceOutputs``."""
     total, slot = rays.origins.shape[0], take(next_task, 1)

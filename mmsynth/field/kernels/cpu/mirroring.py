@@ -133,7 +133,7 @@ def _reflect_rows(begin, end, lamps, mirrors, amount, axis, degree):  # type: ig
             degree[row, k] = terms[20] * gate[i, 4]
 
 
-@kernel()
+@kernel
 def reflect(next_task, lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
     """See ``mirroring.reflect``."""
     surfaces = mirrors.points.shape[0]
@@ -187,7 +187,7 @@ def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # typ
                     out[m] += amount * passed * lamps.spectrum[k, measured.output[m]]
 
 
-@kernel()
+@kernel
 def mirror(next_task, lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """See ``mirroring.mirror``; ``measured.ray`` never decreases."""
     rays = behind.shape[0]
@@ -300,7 +300,7 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
             g_material[row, 0] = g_alpha * (_ONE - _LEAST) * gate[place, 0] * (_ONE - gate[place, 0])
 
 
-@kernel()
+@kernel
 def mirror_backward(next_task, lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """g: (M,) gradients of the numbers; out: ``Gradients``."""
     rays = behind.shape[0]

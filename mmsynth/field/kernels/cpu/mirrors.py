@@ -55,7 +55,7 @@ class ChunkScratch(NamedTuple):
     gh: np.ndarray
 
 
-@kernel()
+@kernel
 def lamps_and_layers(light):  # type: ignore[no-untyped-def]
     """Of a ``LightNetwork``: which outputs of its last layer there are (5 + K,), the lamps that there are, its layers with these."""
     parts = len(light.second_bias) - len(light.position)

@@ -92,7 +92,7 @@ def take_parts(next_task, task, others, done, places, numbers):  # type: ignore[
         task = take(next_task, 0) - others
 
 
-@kernel()
+@kernel
 def adam_tensor(next_task, p, g, m, v, rate, beta1, beta2, root, epsilon, sparse):  # type: ignore[no-untyped-def]
     """``adam_part`` of a whole tensor (N,)."""
     begin = take(next_task, 0) * ADAM_CHUNK

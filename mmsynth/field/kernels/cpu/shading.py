@@ -196,7 +196,7 @@ class Layers(NamedTuple):
     second_bias: np.ndarray
 
 
-@kernel()
+@kernel
 def two_layers(first, first_bias, second, second_bias):  # type: ignore[no-untyped-def]
     """Weights (units, inputs) and biases as the kernels take them."""
     return Layers(padded(first), padded(first.T), first_bias, padded(second), padded(second.T), second_bias)
@@ -264,7 +264,7 @@ def compare_rays(  # type: ignore[no-untyped-def]
     return loss
 
 
-@kernel()
+@kernel
 def compare(  # type: ignore[no-untyped-def]
     next_task, rays, measured, gain, mirrored, layers, heads, heads_bias, learn, store, loss, squared, g_features, g_share, g_gain,
     g_mirrored,
@@ -308,7 +308,7 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
             outputs[begin + i, k] = out[i, k] + heads_bias[k]
 
 
-@kernel()
+@kernel
 def shade(next_task, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """See ``reference.shade``, of rays that all have one degree."""
     rays, turned = len(features), padded(heads.T)

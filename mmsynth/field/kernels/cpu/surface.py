@@ -20,7 +20,7 @@ _f = np.float32
 _ZERO, _ONE, _MOST = _f(0.0), _f(1.0), _f(253 - OUTSIDE)
 
 
-@kernel()
+@kernel
 def surface_forward(next_task, positions, grid, layers, keep, store, out):  # type: ignore[no-untyped-def]
     """Signed distance of (N, 3) positions; store: see ``SurfaceStore``, a slot per block when ``keep``, else per thread."""
     count, slot = positions.shape[0], take(next_task, 1)
@@ -39,7 +39,7 @@ def surface_forward(next_task, positions, grid, layers, keep, store, out):  # ty
         chunk = take(next_task, 0)
 
 
-@kernel()
+@kernel
 def surface_backward(next_task, gradient, active, layers, store):  # type: ignore[no-untyped-def]
     """Gradients of the weights per block; hidden units and features become gradients."""
     count = gradient.shape[0]
@@ -55,7 +55,7 @@ def surface_backward(next_task, gradient, active, layers, store):  # type: ignor
         chunk = take(next_task, 0)
 
 
-@kernel()
+@kernel
 def surface_positions(next_task, gradient, grid, layers, store, positions_out):  # type: ignore[no-untyped-def]
     """After ``surface_backward``: gradients of the positions (N, 3)."""
     count = gradient.shape[0]
@@ -68,7 +68,7 @@ def surface_positions(next_task, gradient, grid, layers, store, positions_out): 
         chunk = take(next_task, 0)
 
 
-@kernel()
+@kernel
 def surface_scatter(next_task, count, grid, store, gradient):  # type: ignore[no-untyped-def]
     """The table's gradient, one task per level."""
     level = take(next_task, 0)
@@ -89,7 +89,7 @@ def _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
             states[where[i]] = np.uint8(SOLID if value[i] < -cells.margin else SHELL)
 
 
-@kernel()
+@kernel
 def classify(next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
     """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. store: a slot for each thread."""
     slot, side, n = take(next_task, 1), len(centre), 0

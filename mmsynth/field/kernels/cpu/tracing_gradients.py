@@ -78,7 +78,7 @@ def samples_backward(block, hidden, g, samples, active, layers, turned_out, outp
         surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
 
 
-@kernel()
+@kernel
 def trace_backward(  # type: ignore[no-untyped-def]
     next_task, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
@@ -106,7 +106,7 @@ def trace_backward(  # type: ignore[no-untyped-def]
         chunk = take(next_task, 0)
 
 
-@kernel()
+@kernel
 def trace_scatter(next_task, rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
     chunks = (rays + CHUNK - 1) // CHUNK
@@ -131,7 +131,7 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
     return k * gx + change * x, k * gy + change * y, k * gz + change * z
 
 
-@kernel()
+@kernel
 def trace_rays_backward(  # type: ignore[no-untyped-def]
     next_task, origins, directions, grid, layers, appearance, store, origins_out, directions_out
 ):
