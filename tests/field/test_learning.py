@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 import torch
+from numba.core.runtime import _nrt_python, rtsys
 from test_drawing import _scene, _selection
 from torch import Tensor, nn
 
 from mmsynth.field import kernels
 from mmsynth.field.encoding import HashGrid
 from mmsynth.field.kernels import learning
+from mmsynth.field.kernels.cpu import learning as fused
 from mmsynth.field.kernels.cpu import tasks
 from mmsynth.field.light import Light
 from mmsynth.field.occupancy import Occupancy
@@ -228,6 +230,29 @@ def test_what_fails_beside_the_kernels_is_raised(threads: int, use_threads: Call
         with pytest.raises(LookupError, match="beside"):
             kernels.learn(kernels.arrange(told), *arguments)
     assert torch.isfinite(kernels.learn(kernels.arrange(told)).loss)
+
+
+@pytest.mark.parametrize("case", ["plain", "background", "far light", "lamps and background"])
+def test_kernels_of_a_step_ask_for_no_memory(case: str, monkeypatch: pytest.MonkeyPatch, use_threads: Callable[[int], None]) -> None:
+    """But for what lamps need of each ray, which they give back."""
+    use_threads(1)
+    _nrt_python.memsys_enable_stats()
+    counted: dict[str, tuple[int, int]] = {}
+
+    def counting(kernel: Callable[..., None]) -> Callable[..., None]:
+        def call(*arguments: Any) -> None:
+            before = rtsys.get_allocation_stats()
+            kernel(*arguments)
+            after = rtsys.get_allocation_stats()
+            counted[kernel.__name__] = after.mi_alloc - before.mi_alloc, after.mi_free - before.mi_free
+
+        return call
+
+    for kernel in (fused.learn_rays, fused.finish):
+        monkeypatch.setattr(fused, kernel.__name__, counting(kernel))
+    assert torch.isfinite(_with_update(_step(*CASES[case]), torch.float32)[0].loss)
+    (asked, given_back), finishing = counted["learn_rays"], counted["finish"]
+    assert asked == given_back and (asked > 0) == ("lamps" in case) and finishing == (0, 0)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

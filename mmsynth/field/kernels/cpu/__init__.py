@@ -2,7 +2,7 @@
 
 Begin with ``operations``, the autograd functions, and ``steps``, a step of a fit; the kernels are in ``blocks`` (what all are made of),
 ``surface``, ``marching`` and ``tracing_gradients``, ``shading``, ``mirroring``, ``drawing``, ``optimiser`` and, all together in a step of
-a fit, ``learning``; ``tasks`` is how threads share them, ``jit`` how they are compiled.
+a fit, ``learning``; ``tasks`` is how threads share them, ``stack`` where they keep what they make, ``jit`` how they are compiled.
 """
 
 from mmsynth.field.kernels.cpu.caching import kept_in

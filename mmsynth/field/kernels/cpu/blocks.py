@@ -29,7 +29,7 @@ from mmsynth.field.kernels.cpu.corners import (
     same_cell,
     to_unit,
 )
-from mmsynth.field.kernels.cpu.jit import kernel, part
+from mmsynth.field.kernels.cpu.jit import allocating_kernel, part
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, element, padded, splat, whole
 
 _VECTOR = ir.VectorType(ir.FloatType(), FEATURES)
@@ -129,7 +129,7 @@ def surface_layers(network: Any) -> SurfaceLayers:
     return SurfaceLayers(hidden, turned, output, network.inner_radius, network.outer_radius)
 
 
-@kernel
+@allocating_kernel
 def surface_weights(hidden, output):  # type: ignore[no-untyped-def]
     """The arrays of ``SurfaceLayers``."""
     units, tiles = hidden.shape[0], padded(hidden, FIRST_FEATURE_ROW)

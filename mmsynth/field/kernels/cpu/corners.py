@@ -8,48 +8,21 @@ set fractions stays written out: through one function LLVM makes no vectors of e
 from __future__ import annotations
 
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 
 from mmsynth.field.kernels.constants import FEATURES, HASH_PRIMES
 from mmsynth.field.kernels.cpu.jit import inlined, part
 from mmsynth.field.kernels.cpu.matrices import whole
+from mmsynth.field.kernels.cpu.stack import on_stack
 
 AT_ONCE = 64  # positions
 _LANES = 16  # numbers in a vector
 _ROW = np.uint32(4 * FEATURES)  # bytes
 _P1 = np.uint32(HASH_PRIMES[1])
 _P2 = np.uint32(HASH_PRIMES[2])
-
-
-def _on_stack(kind: types.Type, parts: int):  # type: ignore[no-untyped-def]
-    """An intrinsic that gives an array of so many parts, as long as the function runs that it is called in; what is in it is undefined."""
-
-    @intrinsic
-    def on_stack(typingctx):  # type: ignore[no-untyped-def]
-        array_kind = types.Array(kind, 1, "C")
-
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            number = context.get_value_type(kind)
-            data = cgutils.alloca_once(builder, ir.ArrayType(number, parts * AT_ONCE))
-            array = context.make_array(array_kind)(context, builder)
-            shape = [context.get_constant(types.intp, parts * AT_ONCE)]
-            size = context.get_constant(types.intp, context.get_abi_sizeof(number))
-            first = builder.bitcast(data, number.as_pointer())
-            populate_array(array, data=first, shape=shape, strides=[size], itemsize=size, meminfo=None)
-            return array._getvalue()
-
-        return array_kind(), codegen
-
-    return on_stack
-
-
-of_axes = _on_stack(types.float32, 3)
-of_corners = _on_stack(types.float32, 8)
-places_of_corners = _on_stack(types.uint32, 8)
+of_axes = on_stack(types.float32, 3 * AT_ONCE)
+of_corners = on_stack(types.float32, 8 * AT_ONCE)
+places_of_corners = on_stack(types.uint32, 8 * AT_ONCE)
 
 
 @part()

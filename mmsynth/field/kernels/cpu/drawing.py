@@ -122,13 +122,15 @@ def drawing_tasks(to_fill):  # type: ignore[no-untyped-def]
 def draw_chunk(chunk, to_fill):  # type: ignore[no-untyped-def]
     """A task: some of the rays."""
     frames, cameras, modalities, selection, rays, key = to_fill.drawing
-    n_modalities, n_drawn = rays.shape[0], np.count_nonzero(rays)
-    rays_end, numbers_end = np.cumsum(rays), np.cumsum(rays * modalities.values)
+    n, rays_begin, numbers_begin, n_drawn = np.int64(0), np.int64(0), np.int64(0), 0
+    for count in rays:
+        n_drawn += count > 0
     out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame, measured = to_fill.drawn
     target, of_ray, output, axes, level, saturation, weight = measured
     axes_begin = target.shape[0] - axes.shape[0]
     for ray in range(chunk * CHUNK, min(out_jitter.shape[0], (chunk + 1) * CHUNK)):
-        n = _first_above(rays_end, 0, n_modalities - 1, ray)
+        while ray >= rays_begin + rays[n]:
+            rays_begin, numbers_begin, n = rays_begin + rays[n], numbers_begin + rays[n] * modalities.values[n], n + 1
         tile = _first_above(
             selection.ends, np.int64(modalities.first_tile[n]), np.int64(modalities.first_tile[n + 1]) - 1, _bits(key, ray, DRAW_TILE)
         )
@@ -165,7 +167,6 @@ def draw_chunk(chunk, to_fill):  # type: ignore[no-untyped-def]
         else:
             out_alpha[ray] = modalities.opaque[n]
         mosaic, analyser = np.int64(modalities.pattern_first[n]), np.int64(modalities.analyser_first[n])
-        rays_begin, numbers_begin = rays_end[n] - rays[n], numbers_end[n] - rays[n] * values
         share = out_weight[ray] / _f(n_drawn * rays[n] * values)
         if analyser >= 0:
             along = turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz

@@ -55,16 +55,28 @@ class _PartCompiler(CompilerBase):
 _common = functools.partial(njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def allocating_kernel(function: Callable[..., Any]) -> Any:
     """What Python calls; its code is kept on disk, with that of all that it calls."""
-    out = _common(function)
-    out._cache = KernelCache(function)
-    return out
+    return _kept(_common(function))
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """The same of a function that makes no arrays but views and those of ``stack``."""
+    return _kept(_common(function, _nrt=False))
+
+
+def _kept(compiled: Any) -> Any:
+    compiled._cache = KernelCache(compiled.py_func)
+    return compiled
 
 
 # called from kernels alone: without machine code of its own and the code that takes arguments from Python, which were a third of the time
 # to compile. Python that calls one all the same ends in a crash (tests: ``from_python``)
-part = functools.partial(_common, no_cpython_wrapper=True, pipeline_class=_PartCompiler)
+allocating_part = functools.partial(_common, no_cpython_wrapper=True, pipeline_class=_PartCompiler, _nrt=True)
+
+# makes no arrays but views and those of ``stack``, nor does what it calls, but for allocating parts: where none is made none has to be
+# counted, which was a third of what LLVM was given. Numba refuses what makes one
+part = functools.partial(allocating_part, _nrt=False)
 
 # put into what calls it before types are known
 inlined = functools.partial(njit, inline="always", error_model="numpy")

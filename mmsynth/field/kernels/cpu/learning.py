@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
@@ -23,6 +24,7 @@ from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backwar
 from mmsynth.field.kernels.cpu.optimiser import take_parts
 from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
 from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take, tell, wait
 from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
 from mmsynth.field.kernels.parameters import Rays, ShadedRays
@@ -30,6 +32,7 @@ from mmsynth.field.kernels.parameters import Rays, ShadedRays
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
 _MOSTLY_BLOCKED = _f(MOSTLY_BLOCKED)
+_of_rays = on_stack(types.float32, CHUNK)
 
 
 class TableStore(NamedTuple):
@@ -81,7 +84,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     sections = find_sections(0, count, slot, here, wide, sampling, store, weight, depth)
     composite(0, count, slot, sections, appearance, store, features, distance, shown)
     share, rows = weight.reshape(2 * CHUNK), features.reshape(2 * CHUNK, -1)
-    opacity = np.empty(CHUNK, np.float32)
+    opacity = _of_rays()
     loss = 0.0
     for i in range(count):
         behind[i] = CHUNK + i if weight[1, i] != _ZERO else -1
@@ -234,20 +237,20 @@ def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, g
         for i in range(len(rows)):
             add_sums(out.second[:chunks, i], g.light_second[rows[i]])
             add_sums(out.second_bias[:chunks, i : i + 1], g.light_second_bias[rows[i] : rows[i] + 1])
-        lamp = np.empty(spectrum.shape[1], np.float32)
         for i in range(len(used)):
             add_sums(out.position[:chunks, i], g.position[used[i]])
-            lamp[:] = _ZERO
-            add_sums(out.spectrum[:chunks, i], lamp)
-            for j in range(lamp.shape[0]):
-                g.log_spectrum[used[i], j] += spectrum[i, j] * lamp[j]
+            for j in range(spectrum.shape[1]):
+                total = _ZERO
+                for chunk in range(chunks):
+                    total += out.spectrum[chunk, i, j]
+                g.log_spectrum[used[i], j] += spectrum[i, j] * total
     add_sums(out.far[:chunks], g.far_light)
-    total = np.float64(0.0)
+    sum_of_all = np.float64(0.0)
     for matrix in (g.hidden, g.first, g.second, g.heads, g.light_first, g.light_second, g.position, g.log_spectrum):
-        total += matrix.sum()
+        sum_of_all += matrix.sum()
     for vector in (g.output, g.first_bias, g.second_bias, g.heads_bias, g.light_first_bias, g.light_second_bias, g.far_light):
-        total += vector.sum()
-    return total
+        sum_of_all += vector.sum()
+    return sum_of_all
 
 
 @kernel

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import types
 
 from mmsynth.field.kernels.constants import (
     ALONG_FACE,
@@ -34,6 +35,7 @@ from mmsynth.field.kernels.constants import (
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
 CHUNK = 128  # rays
@@ -44,6 +46,9 @@ _LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
 _NO_CROSSING = np.float32(NO_CROSSING)
 _FACE_OVERSHOOT = np.float32(FACE_OVERSHOOT)
+_numbers_of_rays, _sums_of_rays = on_stack(types.float32, CHUNK), on_stack(types.float64, CHUNK)
+_states_of_rays, _flags_of_rays = on_stack(types.uint8, CHUNK), on_stack(types.boolean, CHUNK)
+_sums_of_lanes, _rays_of_lanes = on_stack(types.float64, LANES), on_stack(types.int32, LANES)
 
 
 @inlined()
@@ -134,19 +139,15 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     min_slope = np.float32(sampling.min_slope)
     origins, directions = rays.origins, rays.directions
     t_of, f_of, p_of, q_of, counts = store.t_of, store.f_of, store.p_of, store.q_of, store.counts
-    depths, densities = np.empty(LANES, np.float64), np.empty(LANES, np.float64)
+    depths, densities = _sums_of_lanes(), _sums_of_lanes()
     block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
     # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
-    where = np.empty(CHUNK, np.float32)
-    tau_of = np.zeros(CHUNK, np.float64)
+    where, speed_of, reach_of = _numbers_of_rays(), _numbers_of_rays(), _numbers_of_rays()
+    tau_of, state_of, skipped = _sums_of_rays(), _states_of_rays(), _flags_of_rays()
+    lanes, todo = _rays_of_lanes(), _rays_of_lanes()
     for i in range(count):
         where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
-        counts[slot, i] = 0
-    speed_of = np.empty(CHUNK, np.float32)
-    reach_of = np.empty(CHUNK, np.float32)
-    state_of = np.empty(CHUNK, np.uint8)
-    lanes, todo = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
-    skipped = np.zeros(CHUNK, np.bool_)
+        counts[slot, i], tau_of[i], skipped[i] = 0, 0.0, False
     going = 0
     waiting = 0
     used = np.int64(0)

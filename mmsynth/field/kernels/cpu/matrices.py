@@ -13,13 +13,16 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from mmsynth.field.kernels.cpu.jit import inlined, part
+from mmsynth.field.kernels.cpu.jit import allocating_part, inlined, part
+from mmsynth.field.kernels.cpu.stack import on_stack
 
 TILE_ROWS, TILE_COLS = 4, 16
 # Sums of four tiles at once fit into AVX-512's 32 registers of 16 numbers. AVX2 has 16 of 8, half of them for one tile: more would spill,
 # at a third of the speed.
 _FOUR_AT_ONCE = bool(binding.get_host_cpu_features().get("avx512f"))
 _VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
+_TOTALS = 64
+_totals = on_stack(types.float32, _TOTALS)
 _BYTE, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
 
 
@@ -116,14 +119,16 @@ def clear(out, rows, columns):  # type: ignore[no-untyped-def]
 def add_sum(parts, out):  # type: ignore[no-untyped-def]
     """out += the sum of matrices (N, ≥ rows, ≥ columns) in their order."""
     rows, columns = out.shape
-    total = np.empty(columns, np.float32)
+    total = _totals()
     for i in range(rows):
-        total[:] = np.float32(0.0)
-        for n in range(parts.shape[0]):
-            for j in range(columns):
-                total[j] += parts[n, i, j]
-        for j in range(columns):
-            out[i, j] += total[j]
+        for begin in range(0, columns, _TOTALS):
+            some = min(_TOTALS, columns - begin)
+            total[:] = np.float32(0.0)
+            for n in range(parts.shape[0]):
+                for j in range(some):
+                    total[j] += parts[n, i, begin + j]
+            for j in range(some):
+                out[i, begin + j] += total[j]
 
 
 @part()
@@ -142,7 +147,7 @@ def whole(count, of):  # type: ignore[no-untyped-def]
     return (count + of - 1) // of * of
 
 
-@part()
+@allocating_part()
 def padded(matrix, first=0):  # type: ignore[no-untyped-def]
     """A copy of whole tiles, whichever way round it is used; of the columns those behind the ``first``."""
     rows, width = matrix.shape

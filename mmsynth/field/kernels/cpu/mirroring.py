@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mmsynth.field.kernels.constants import LEAST_ROUGHNESS, REFRACTIVE_INDEX
-from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
+from mmsynth.field.kernels.cpu.jit import allocating_part, inlined, kernel
 from mmsynth.field.kernels.cpu.logistic import softplus
 from mmsynth.field.kernels.cpu.shading import first_at
 from mmsynth.field.kernels.cpu.tasks import take
@@ -35,7 +35,7 @@ class Gradients(NamedTuple):
     spectrum: np.ndarray
 
 
-@part()
+@allocating_part()
 def _materials(begin, end, mirrors, behind):  # type: ignore[no-untyped-def]
     """log(1 + e^x) and its slope, of the materials x of what some rays meet, ray by ray: (surfaces, 5 + K) each."""
     width, n = mirrors.material.shape[1], 0
@@ -117,7 +117,7 @@ def _around(row, mirrors, out):  # type: ignore[no-untyped-def]
     out[6] = less * less / (_ONE + (product + along) * (product + along))
 
 
-@part()
+@allocating_part()
 def _reflect_rows(begin, end, lamps, mirrors, amount, axis, degree):  # type: ignore[no-untyped-def]
     """``reflect`` of some surfaces."""
     count, width = lamps.position.shape[0], mirrors.material.shape[1]
@@ -150,7 +150,7 @@ def _passed(terms, axes, number):  # type: ignore[no-untyped-def]
     return _f(0.5) * (_ONE + terms[20] * (_TWO * e * e - _ONE))
 
 
-@part()
+@allocating_part()
 def mirror_rays(begin, end, ray0, lamps, mirrors, behind, measured, out):  # type: ignore[no-untyped-def]
     """``mirror`` of some rays; ray0 + begin: the first of them in ``measured.ray``."""
     count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)
@@ -197,7 +197,7 @@ def mirror(next_task, lamps, mirrors, behind, measured, out):  # type: ignore[no
         begin = take(next_task, 0) * CHUNK
 
 
-@part()
+@allocating_part()
 def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """``mirror_backward`` of some rays; gradients of the lamps are added to those of the chunk."""
     count, bright = lamps.position.shape[0], len(measured.ray) - len(measured.axes)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.kernels.cpu import mirroring
-from mmsynth.field.kernels.cpu.jit import kernel, part
+from mmsynth.field.kernels.cpu.jit import allocating_kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, contract, velocity
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, whole
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
@@ -55,7 +55,7 @@ class ChunkScratch(NamedTuple):
     gh: np.ndarray
 
 
-@kernel
+@allocating_kernel
 def lamps_and_layers(light):  # type: ignore[no-untyped-def]
     """Of a ``LightNetwork``: which outputs of its last layer there are (5 + K,), the lamps that there are, its layers with these."""
     parts = len(light.second_bias) - len(light.position)

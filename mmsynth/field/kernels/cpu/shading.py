@@ -13,14 +13,19 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 
 from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
-from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
+from mmsynth.field.kernels.cpu.jit import allocating_kernel, allocating_part, inlined, kernel, part
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
 CHUNK = 64  # rays
 _HUBER = np.float32(HUBER_DELTA)
+_of_surfaces, _places_of_surfaces = on_stack(types.float32, 2 * CHUNK), on_stack(types.int64, 2 * CHUNK)
+_outputs, _slopes_of_both = on_stack(types.float32, 6), on_stack(types.float32, 12)  # of a polarization
+_lights_of_both, _places_of_both = on_stack(types.float32, 2), on_stack(types.int64, 2)
 _FAST = {"contract", "reassoc", "nsz", "arcp"}  # but NaN stays NaN: a loss that is not finite must be seen
 
 
@@ -113,8 +118,7 @@ def _measurements(  # type: ignore[no-untyped-def]
     place_of: of each ray, the row of what is behind that, -1 = nothing. trains: of each ray.
     """
     target, ray, output, axes, level = measured.target, measured.ray, measured.output, measured.axes, measured.level
-    raw, slope = np.empty(6, np.float32), np.empty((2, 6), np.float32)
-    lights, places = np.empty(2, np.float32), np.empty(2, np.int64)
+    raw, slope, lights, places = _outputs(), _slopes_of_both(), _lights_of_both(), _places_of_both()
     bright = len(ray) - len(axes)
     units = heads.shape[1]
     loss = 0.0
@@ -133,9 +137,9 @@ def _measurements(  # type: ignore[no-untyped-def]
                     total += w[k] * h[k]
                 raw[j] = total + heads_bias[column + j]
             if m < bright:
-                lights[a], slope[a, 0] = _softplus(raw[0])
+                lights[a], slope[6 * a] = _softplus(raw[0])
             else:
-                lights[a] = _intensity(raw, axes[m - bright], slope[a])
+                lights[a] = _intensity(raw, axes[m - bright], slope[6 * a :])
             seen += lights[a] * share[places[a]]
         brightness = level[m]  # of what is fully seen
         if len(gain):
@@ -162,7 +166,7 @@ def _measurements(  # type: ignore[no-untyped-def]
                 g_share[places[a]] += pull * lights[a] * brightness
             for j in range(outputs):
                 w, w_out = heads[column + j], heads_out[column + j]
-                p = pull * brightness * share[places[a]] * slope[a, j]
+                p = pull * brightness * share[places[a]] * slope[6 * a + j]
                 heads_bias_out[column + j] += p
                 for k in range(units):
                     w_out[k] += p * h[k]
@@ -196,7 +200,7 @@ class Layers(NamedTuple):
     second_bias: np.ndarray
 
 
-@kernel
+@allocating_kernel
 def two_layers(first, first_bias, second, second_bias):  # type: ignore[no-untyped-def]
     """Weights (units, inputs) and biases as the kernels take them."""
     return Layers(padded(first), padded(first.T), first_bias, padded(second), padded(second.T), second_bias)
@@ -225,8 +229,9 @@ def compare_rays(  # type: ignore[no-untyped-def]
     features, directions, degrees, behind = rays.features, rays.directions, rays.degrees, rays.behind
     width = features.shape[1]
     degree, n = np.int64(0), np.int64(count)
-    ray_of, row_of, place_of = np.empty(2 * CHUNK, np.int64), np.empty(2 * CHUNK, np.int64), np.empty(CHUNK, np.int64)
-    share, g_of = np.empty(2 * CHUNK, np.float32), np.zeros(2 * CHUNK, np.float32)
+    ray_of, row_of, place_of = _places_of_surfaces(), _places_of_surfaces(), _places_of_surfaces()
+    share, g_of = _of_surfaces(), _of_surfaces()
+    g_of[:] = np.float32(0.0)
     for i in range(count):
         degree = max(degree, degrees[begin + i])  # terms of a higher one than any here are zero
         ray_of[i], row_of[i], place_of[i] = begin + i, begin + i, -1
@@ -287,7 +292,7 @@ def compare(  # type: ignore[no-untyped-def]
         chunk = take(next_task, 0)
 
 
-@part()
+@allocating_part()
 def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """Outputs of n rays. heads: (H, outputs), whole tiles."""
     first, second = layers.first_turned, layers.second_turned
@@ -308,7 +313,7 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
             outputs[begin + i, k] = out[i, k] + heads_bias[k]
 
 
-@kernel
+@allocating_kernel
 def shade(next_task, features, directions, degree, layers, heads, heads_bias, outputs):  # type: ignore[no-untyped-def]
     """See ``reference.shade``, of rays that all have one degree."""
     rays, turned = len(features), padded(heads.T)

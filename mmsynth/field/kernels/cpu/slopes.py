@@ -6,10 +6,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 
 from mmsynth.field.kernels.cpu.blocks import surface_block, surface_block_backward
 from mmsynth.field.kernels.cpu.jit import part
 from mmsynth.field.kernels.cpu.marching import CHUNK, contract
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.learning import TAPS
 
 POINTS = 64  # of all space, in a task
@@ -18,6 +20,7 @@ MOST_TAPPED = 2 * CHUNK  # points of a chunk
 _TAPS = np.array(TAPS, np.float32)
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
+_of_taps = on_stack(types.float32, 4 * TAPPED)
 
 
 class TapStore(NamedTuple):
@@ -34,7 +37,7 @@ class TapStore(NamedTuple):
 def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: ignore[no-untyped-def]
     """See ``learning.surface_gradient``: of n points ``at`` (n, 3), whose taps are kept in the slot of ``taps`` behind what is there."""
     move, scale = epsilon / _f(math.sqrt(3.0)), _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
-    values = np.empty(4 * TAPPED, np.float32)
+    values = _of_taps()
     for begin in range(0, n, TAPPED):
         count, used = np.int64(min(TAPPED, n - begin)), np.int64(taps.used[slot, 0])
         block = taps.block[slot, used:]
@@ -58,7 +61,7 @@ def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: i
 def slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  # type: ignore[no-untyped-def]
     """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
     scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
-    values = np.empty(4 * TAPPED, np.float32)
+    values = _of_taps()
     for begin in range(0, n, TAPPED):
         count, used = np.int64(min(TAPPED, n - begin)), first + 4 * begin
         for i in range(count):
@@ -93,12 +96,13 @@ def is_within(p):  # type: ignore[no-untyped-def]
 @part()
 def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, scratch, slot, taps):  # type: ignore[no-untyped-def]
     """The pull at some of the points of all space: its part of the loss."""
-    at, found = points[begin : begin + count], scratch.found[slot]
+    at, found, g = points[begin : begin + count], scratch.found[slot], scratch.at[slot]
     taps.used[chunk, 0] = 0
     taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
     slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
-    loss, g = 0.0, np.zeros((count, 3), np.float32)
+    loss = 0.0
     for i in range(count):
+        g[i, 0], g[i, 1], g[i, 2] = _ZERO, _ZERO, _ZERO
         loss += pull_to_one(found[i], factor, eikonal.shallow if is_within(at[i]) else _ONE, g[i])
     slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
     return loss

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import types
 
 from mmsynth.field.kernels.constants import OUTSIDE, SHELL, SOLID
 from mmsynth.field.kernels.cpu.blocks import (
@@ -12,12 +13,14 @@ from mmsynth.field.kernels.cpu.blocks import (
     surface_block_positions,
 )
 from mmsynth.field.kernels.cpu.jit import kernel, part
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
 POINTS = 128  # positions of a block
 CELLS = 8192  # of a task of ``classify``
 _f = np.float32
 _ZERO, _ONE, _MOST = _f(0.0), _f(1.0), _f(253 - OUTSIDE)
+_places, _values = on_stack(types.int64, POINTS), on_stack(types.float32, POINTS)
 
 
 @kernel
@@ -94,7 +97,7 @@ def classify(next_task, states, centre, cells, grid, layers, store):  # type: ig
     """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. store: a slot for each thread."""
     slot, side, n = take(next_task, 1), len(centre), 0
     block, hidden = store.block[slot], store.hidden[slot]
-    where, value = np.empty(POINTS, np.int64), np.empty(POINTS, np.float32)
+    where, value = _places(), _values()
     while True:
         begin = take(next_task, 0) * CELLS
         if begin >= len(states):

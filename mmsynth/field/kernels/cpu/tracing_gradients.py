@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import types
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, LEAST_WEIGHT, LN2, MAX_SAMPLES_PER_RAY
 from mmsynth.field.kernels.cpu.blocks import (
@@ -13,11 +14,13 @@ from mmsynth.field.kernels.cpu.blocks import (
     surface_block_backward,
     surface_block_positions,
 )
-from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
+from mmsynth.field.kernels.cpu.jit import allocating_kernel, inlined, kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
+_of_samples = on_stack(types.float64, MAX_SAMPLES_PER_RAY)
 
 
 @part()
@@ -28,7 +31,7 @@ def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, s
     sections = store.s_count[chunk, 0]
     sf = store.s_block[chunk]
     at = 0
-    g_section = np.empty(MAX_SAMPLES_PER_RAY, np.float64)
+    g_section = _of_samples()
     for i in range(count):
         o = begin + i
         samples, second = store.counts[chunk, i], store.second[chunk, i]
@@ -131,7 +134,7 @@ def _back_to_world(x, y, z, gx, gy, gz, contracted):  # type: ignore[no-untyped-
     return k * gx + change * x, k * gy + change * y, k * gz + change * z
 
 
-@kernel
+@allocating_kernel
 def trace_rays_backward(  # type: ignore[no-untyped-def]
     next_task, origins, directions, grid, layers, appearance, store, origins_out, directions_out
 ):
