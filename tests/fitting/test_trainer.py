@@ -42,6 +42,8 @@ from mmsynth.scene.load import load_scene
 from mmsynth.scene.scene import Frame, Region, Scene, Sensor, Split, rig_of
 from mmsynth.sensors.camera import Camera, ray_map, resized
 
+pytestmark = pytest.mark.usefixtures("decided_by_few_rays")
+
 # every number that a result here depends on: the defaults are tuned from time to time
 SMALL = Recipe().with_changes({
     "sampling.samples_per_step": 2048, "sampling.samples_growth": 4.0, "sampling.initial_rays": 128, "sampling.evenly": 0.5,
@@ -122,7 +124,6 @@ def test_a_fit_learns_and_its_run_gives_the_same_field_back(scene: Scene, tmp_pa
     assert field.manifest["skipped_steps"] == 0 and field.manifest["steps"] == 300
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fit_with_a_background_learns_too(tmp_path: Path) -> None:
     """A sky whose colour is that of the direction, and a grey ball before it."""
 
@@ -152,7 +153,6 @@ class Killed(Exception):
     pass
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("decide_at", [0.2, 0.8])  # before and after the kill
 def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, decide_at: float) -> None:
     recipe = _recipe(
@@ -179,7 +179,6 @@ def test_a_killed_fit_resumes_to_the_same_field(scene: Scene, tmp_path: Path, de
     assert resumed.manifest["needs"]["choices"] == whole.manifest["needs"]["choices"]
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fit_goes_on_anywhere_with_the_rays_that_were_drawn_ahead(scene: Scene) -> None:
     """Poses move, and it is chosen anew where rays go, between the drawing of rays and the step that learns from them."""
     changes = {"poses.views": "on", "poses.start_at": 0.3, "sampling.occupancy_every": 8}
@@ -197,7 +196,6 @@ def test_a_fit_goes_on_anywhere_with_the_rays_that_were_drawn_ahead(scene: Scene
         assert all(torch.equal(value, expected[name]) for name, value in _tensors(other.field).items()), step
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_what_is_arranged_beside_the_step_before_is_what_the_step_needs(scene: Scene) -> None:
     """Whatever was decided in between: where rays go, view dependence, rows of tables, lamps, exposure, poses."""
     changes = {
@@ -220,7 +218,6 @@ def test_what_is_arranged_beside_the_step_before_is_what_the_step_needs(scene: S
     assert beforehand.state == when_due.state
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fit_that_is_looked_at_comes_to_the_same_field(scene: Scene, tmp_path: Path) -> None:
     frame = scene.frames_of("rgb")[0]
     lit = []
@@ -237,7 +234,6 @@ def test_a_fit_that_is_looked_at_comes_to_the_same_field(scene: Scene, tmp_path:
         assert torch.equal(value, alone[name]), name
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("average", [0.0, 0.2])
 def test_the_field_is_the_mean_over_the_last_steps(scene: Scene, tmp_path: Path, average: float) -> None:
     field = fit(scene, tmp_path, recipe=_recipe(**{"schedule.ema_fraction": average}), steps=30)
@@ -250,7 +246,6 @@ def test_the_field_is_the_mean_over_the_last_steps(scene: Scene, tmp_path: Path,
         assert not average or not torch.equal(parameter, saved["field"][name]), name
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_the_log_of_a_resumed_fit_has_every_step_once(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit is killed after a log line and before its checkpoint: that line is written again, not twice."""
     ticks = iter(float(i) * 2 for i in range(10_000))
@@ -270,7 +265,6 @@ def test_the_log_of_a_resumed_fit_has_every_step_once(scene: Scene, tmp_path: Pa
     assert all(math.isfinite(x["loss"]) and set(x["psnr"]) == set(scene.sensors) for x in lines)
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_an_interrupted_fit_says_how_to_go_on(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     step = Trainer.run_step
 
@@ -287,7 +281,6 @@ def test_an_interrupted_fit_says_how_to_go_on(scene: Scene, tmp_path: Path, monk
     assert saved is not None and saved["state"]["step"] == 0  # none of the steps since was saved, none of them half done
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_what_a_gpu_compiles_in_a_step_is_not_time_of_training(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four steps of ten seconds the first and the third make kernels."""
     step, made, now = Trainer.run_step, [0, 1, 1, 2, 2], [0.0]
@@ -304,14 +297,12 @@ def test_what_a_gpu_compiles_in_a_step_is_not_time_of_training(scene: Scene, tmp
     assert saved is not None and saved["state"]["elapsed"] == 20.0
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_the_seed_decides_the_field(scene: Scene, tmp_path: Path) -> None:
     a, b, c = (_tensors(fit(scene, tmp_path / str(i), recipe=SMALL, steps=6, seed=s)) for i, s in enumerate((0, 0, 1)))
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert not torch.equal(a["appearance.table"], c["appearance.table"])
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_checkpoint_of_another_fit_is_refused(scene: Scene, tmp_path: Path) -> None:
     fit(scene, tmp_path, recipe=SMALL, steps=3)
     with pytest.raises(InputError, match="seed"):
@@ -330,7 +321,6 @@ def test_a_checkpoint_of_another_fit_is_refused(scene: Scene, tmp_path: Path) ->
 # --- length
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_fit_takes_the_steps_it_was_given(scene: Scene, tmp_path: Path) -> None:
     news: list[FitProgress] = []
     started = []
@@ -341,7 +331,6 @@ def test_a_fit_takes_the_steps_it_was_given(scene: Scene, tmp_path: Path) -> Non
     assert all(n.rays_per_s > 0 and n.samples_per_s > n.rays_per_s / 10 and set(n.psnr) == set(scene.sensors) for n in news)
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_a_budget_ends_a_fit_by_the_clock(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that goes on by a second each time it is asked."""
     ticks = iter(range(10_000))
@@ -370,7 +359,6 @@ def test_length_is_steps_or_time(scene: Scene) -> None:
             Trainer(scene, SMALL, steps, budget, 0, "cpu")
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 @pytest.mark.parametrize("grown", [1.0, 9.0])
 def test_the_number_of_rays_follows_the_samples(scene: Scene, grown: float) -> None:
     trainer = _trainer(scene, 80, **{"sampling.occupancy_every": 4, "sampling.samples_growth": grown})
@@ -434,7 +422,6 @@ def test_a_gradient_that_is_not_finite_skips_the_step(scene: Scene, what: str, m
     assert all(torch.isfinite(p).all() for p in trainer.field.parameters())
 
 
-@pytest.mark.usefixtures("decided_by_few_rays")
 def test_skipped_steps_are_counted_and_reported(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     warm_up()  # else it is the first to call what is counted here
     calls = []
