@@ -78,24 +78,24 @@ def distort_jacobian(xy: Tensor, k: Tensor) -> Tensor:
     return torch.stack([torch.stack([along, across], -1), torch.stack([across, down], -1)], -2)
 
 
+def _remembered(find: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """Of lenses (..., 8); what is found of one alone is kept: each tile of a picture asks for its camera's."""
+
+    @functools.lru_cache(maxsize=256)
+    def of_one(k: tuple[float, ...], dtype: torch.dtype) -> Tensor:
+        return find(torch.tensor(k, dtype=dtype))
+
+    @functools.wraps(find)
+    def found(k: Tensor) -> Tensor:
+        return of_one(tuple(k.tolist()), k.dtype) if k.ndim == 1 and k.device.type == "cpu" else find(k.detach())
+
+    return found
+
+
+@_remembered
 def fold_radius(k: Tensor) -> Tensor:
     """Ideal radius up to which the radial profile of Brown-Conrady lenses rises, (..., 8) → (...); at most tan 80°, ∞ of a pinhole."""
-    return _known(_fold_radius, k)
 
-
-def _known(find: Callable[[Tensor], Tensor], k: Tensor) -> Tensor:
-    """What is found of lenses; of one alone it is remembered: each tile of a picture asks for its camera's."""
-    if k.ndim == 1 and k.device.type == "cpu":
-        return _of_one(find, tuple(k.tolist()), k.dtype)
-    return find(k.detach())
-
-
-@functools.lru_cache(maxsize=256)
-def _of_one(find: Callable[[Tensor], Tensor], k: tuple[float, ...], dtype: torch.dtype) -> Tensor:
-    return find(torch.tensor(k, dtype=dtype))
-
-
-def _fold_radius(k: Tensor) -> Tensor:
     def slope(angle: Tensor) -> Tensor:
         r2 = torch.tan(angle) ** 2
         radial, d = _radial(r2, k[..., None, :])
@@ -104,6 +104,7 @@ def _fold_radius(k: Tensor) -> Tensor:
     return torch.where((k != 0).any(-1), torch.tan(_first_fall(slope, STEEPEST, k)), torch.inf)
 
 
+@_remembered
 def _upright_radius(k: Tensor) -> Tensor:
     """Ideal radius up to which tangential terms fold in no direction, (..., 8) → (...).
 
@@ -167,7 +168,7 @@ def _undistorted(target: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     there, reached = _distorted(*point, lens), torch.hypot(*point)
     valid = (torch.hypot(aim[0] - there[0], aim[1] - there[1]) < _TOLERANCE) & (reached <= limit[..., None])
     if bool(lens[..., 2:4].any()):  # tangential terms may fold, too: the orientation holds all the way from the axis
-        index = torch.nonzero(valid & (reached > _known(_upright_radius, lens)[..., None]), as_tuple=True)
+        index = torch.nonzero(valid & (reached > _upright_radius(lens)[..., None]), as_tuple=True)
         if len(index[0]):
             x, y, lenses = point[0][index][:, None], point[1][index][:, None], _at(index, lens, distance)
             for share in torch.linspace(0.0, 1.0, _ALONG + 1)[1:].tolist():

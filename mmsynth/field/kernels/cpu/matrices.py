@@ -21,7 +21,7 @@ TILE_ROWS, TILE_COLS = 4, 16
 # at a third of the speed.
 _FOUR_AT_ONCE = bool(binding.get_host_cpu_features().get("avx512f"))
 _VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
-_TOTALS = 64
+_TOTALS = 64  # columns that are summed at once
 _totals = on_stack(types.float32, _TOTALS)
 _BYTE, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
 
