@@ -247,13 +247,13 @@ def test_a_loss_is_the_same_without_a_gradient() -> None:
 
 
 def test_no_room_is_made_for_gradients_that_nobody_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Deciding about lamps compares 20,480 rays, 320 chunks, each with gradients of all weights."""
-    slots, store, case = [], stores.Store, _case(600)
+    """Deciding about lamps compares 20,480 rays, 40 tasks, each with gradients of all weights."""
+    slots, store, case = [], stores.Store, _case(2500)
     monkeypatch.setattr(stores, "Store", lambda n, kind, sizes: slots.append(n) or store(n, kind, sizes))
     with torch.no_grad():
         _compare(case)
     _compare(case)
-    assert slots == [kernel_threads(), -(-len(case.behind) // cpu_shading.CHUNK)]
+    assert slots == [kernel_threads(), -(-len(case.behind) // (cpu_shading.TOGETHER * cpu_shading.CHUNK))]
 
 
 def test_losses_do_not_share_what_they_keep() -> None:

@@ -212,18 +212,18 @@ class _Compare(torch.autograd.Function):
         mirrored: Tensor,
         *weights: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        chunks = -(-len(rays.behind) // shading.CHUNK)
+        tasks = -(-len(rays.behind) // (shading.TOGETHER * shading.CHUNK))
         tensors = ShaderWeights(*weights)
-        arrays = (store := shading_store(max(chunks if learn else 0, kernel_threads()), tensors)).arrays
-        loss, squared = np.zeros(chunks), torch.empty(len(measured.target))
+        arrays = (store := shading_store(max(tasks if learn else 0, kernel_threads()), tensors)).arrays
+        loss, squared = np.empty(tasks), torch.empty(len(measured.target))
         gradients = [torch.empty(x.shape) for x in (features, share, gain, mirrored)]
         take_all(
-            chunks, shading.compare, as_arrays(rays), as_arrays(measured), as_array(gain), as_array(mirrored),
+            tasks, shading.compare, as_arrays(rays), as_arrays(measured), as_array(gain), as_array(mirrored),
             *shader_layers(as_arrays(tensors)), learn, arrays, loss, squared.numpy(), *(g.numpy() for g in gradients),
         )  # fmt: skip
         if learn:
             for name, weight in zip(ShaderWeights._fields, weights, strict=True):
-                whole = getattr(arrays, f"{name}_out")[:chunks].sum(0)
+                whole = getattr(arrays, f"{name}_out")[:tasks].sum(0)
                 gradients.append(torch.from_numpy(whole[tuple(slice(n) for n in weight.shape)]))
             ctx.gradients = gradients
         del store  # not before its arrays were read
@@ -252,7 +252,7 @@ def reflect(position: Tensor, mirrors: Mirrors) -> Reflection:
     surfaces, count = len(mirrors.points), len(position)
     found = Reflection(torch.empty(surfaces, count), torch.empty(surfaces, count, 3), torch.empty(surfaces, count))
     lamps = as_arrays(Lamps(position, torch.empty(count, 0)))
-    take_all(-(-surfaces // mirroring.CHUNK), mirroring.reflect, lamps, as_arrays(mirrors), *(x.numpy() for x in found))
+    take_all(-(-surfaces // mirroring.SURFACES), mirroring.reflect, lamps, as_arrays(mirrors), *(x.numpy() for x in found))
     return found
 
 

@@ -2,7 +2,7 @@
 
 Work is cut into chunks of ``CHUNK`` rays; what they meet passes the layers of the shader as matrices with a row per surface. A ray
 needs few of the shader's outputs (a pixel under a mosaic one, a polarization six), and only those are computed. Gradients of weights
-are summed per chunk and the chunks in order, whatever the number of threads.
+are summed per task of ``TOGETHER`` chunks, and the tasks in order, whatever the number of threads.
 
 Matrices have whole tiles, see ``matrices``: they are padded with zeros.
 """
@@ -15,13 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from mmsynth.field.kernels.constants import HARMONICS, HUBER_DELTA
+from mmsynth.field.kernels.constants import HUBER_DELTA
 from mmsynth.field.kernels.cpu.jit import allocating_kernel, allocating_part, inlined, kernel, part
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
 CHUNK = 64  # rays
+TOGETHER = 8  # chunks of a task of ``compare``: 40 KB of gradients for each chunk would be a third of its time
 _HUBER = np.float32(HUBER_DELTA)
 _of_surfaces, _places_of_surfaces = on_stack(types.float32, 2 * CHUNK), on_stack(types.int64, 2 * CHUNK)
 _outputs, _slopes_of_both = on_stack(types.float32, 6), on_stack(types.float32, 12)  # of a polarization
@@ -238,9 +239,9 @@ def compare_rays(  # type: ignore[no-untyped-def]
         if behind[begin + i] >= 0:
             ray_of[n], row_of[n], place_of[i] = begin + i, behind[begin + i], n
             n += 1
-    rows, inputs, used = whole(n, TILE_ROWS), whole(width + (HARMONICS if degree else 1), TILE_COLS), whole(width, TILE_COLS)
+    rows, inputs, used = whole(n, TILE_ROWS), width + (degree + 1) * (degree + 1), whole(width, TILE_COLS)
     units = h1.shape[1]
-    clear(x, rows, inputs)
+    clear(x, rows, whole(inputs, TILE_COLS))
     clear(g2, rows, units)
     for i in range(n):
         o, row = ray_of[i], row_of[i]
@@ -259,7 +260,7 @@ def compare_rays(  # type: ignore[no-untyped-def]
         layer_backward(n, h1, units, g2, h2, second_out, second_bias_out)
         clear(g1, rows, units)
         add_product(g2, layers.second, g1, rows, units, units)
-        layer_backward(n, x, inputs, g1, h1, first_out, first_bias_out)
+        layer_backward(n, x, whole(inputs, TILE_COLS), g1, h1, first_out, first_bias_out)
         clear(x, rows, used)
         add_product(g1, layers.first, x, rows, units, used)
         for i in range(n):
@@ -275,21 +276,22 @@ def compare(  # type: ignore[no-untyped-def]
     g_mirrored,
 ):  # fmt: skip
     """See ``reference.compare``. ``measured.ray`` never decreases; ``gain`` and ``mirrored`` may be empty; the loss and, where
-    ``learn``, the gradients of weights are per chunk.
+    ``learn``, the gradients of weights are per task.
 
     store: ``ShadingStore``, whose scratch has a slot per thread, and its gradients where there are none.
     """
     total, slot = len(rays.behind), take(next_task, 1)
-    chunk = take(next_task, 0)
-    while chunk * CHUNK < total:
-        begin = chunk * CHUNK
-        of_weights = chunk if learn else slot
+    task = take(next_task, 0)
+    while task < len(loss):
+        of_weights = task if learn else slot
         clear_gradients(store, of_weights)
-        loss[chunk] = compare_rays(
-            begin, min(CHUNK, total - begin), np.int64(0), slot, of_weights, rays, measured, gain, mirrored, layers, heads, heads_bias,
-            learn, store, squared, g_features, g_share, g_gain, g_mirrored,
-        )  # fmt: skip
-        chunk = take(next_task, 0)
+        loss[task] = 0.0
+        for begin in range(task * TOGETHER * CHUNK, min(total, (task + 1) * TOGETHER * CHUNK), CHUNK):
+            loss[task] += compare_rays(
+                begin, min(CHUNK, total - begin), np.int64(0), slot, of_weights, rays, measured, gain, mirrored, layers, heads, heads_bias,
+                learn, store, squared, g_features, g_share, g_gain, g_mirrored,
+            )  # fmt: skip
+        task = take(next_task, 0)
 
 
 @allocating_part()
@@ -305,7 +307,7 @@ def _shade_chunk(begin, n, features, directions, degree, layers, heads, heads_bi
         for j in range(width):
             x[i, j] = features[o, j]
         _harmonics(directions[o, 0], directions[o, 1], directions[o, 2], degree, x[i, width:])
-    layer(n, x, whole(width + (HARMONICS if degree else 1), TILE_COLS), first, layers.first_bias, h1)
+    layer(n, x, width + (degree + 1) * (degree + 1), first, layers.first_bias, h1)
     layer(n, h1, h1.shape[1], second, layers.second_bias, h2)
     add_product(h2, heads, out, rows, h2.shape[1], out.shape[1])
     for i in range(n):
