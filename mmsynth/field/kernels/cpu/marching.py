@@ -1,9 +1,8 @@
 """Rays through the field on the CPU, fused: marching, distances, sections, appearance and composition in one pass.
 
-Work is cut into chunks of ``CHUNK`` rays. Within a chunk up to ``LANES`` rays are under way; each round takes the next sample
-of every one of them, so that grid and network see blocks of up to ``LANES`` positions (see ``blocks``), and a lane whose ray has
-ended takes the next ray that waits. What the backward pass needs stays where the forward pass wrote it, in the ``RayStore``: in the
-chunk's slot when ``keep``, in the thread's otherwise.
+Work is cut into chunks of ``CHUNK`` rays, all of which are under way at once: they go through free cells together (see ``cells``), and
+grid and network see blocks of the next samples of many (see ``blocks``). What the backward pass needs stays where the forward pass wrote
+it, in the ``RayStore``: in the chunk's slot when ``keep``, in the thread's otherwise.
 
 Every sum has a fixed order, whatever the number of threads: chunks are summed in order, and tables are filled level by level.
 """
@@ -16,39 +15,34 @@ import numpy as np
 from numba import types
 
 from mmsynth.field.kernels.constants import (
-    ALONG_FACE,
-    FACE_OVERSHOOT,
     FEATURES,
     FIRST_FEATURE_ROW,
     LAYER_GAP,
-    LEAST_ADVANCE,
     LEAST_WEIGHT,
     LN2,
     LONGEST_STEP,
     MAX_SAMPLES_PER_RAY,
-    NO_CROSSING,
     OUTSIDE,
     SOFT_SURFACE,
     SOLID,
     STAGES,
 )
+from mmsynth.field.kernels.cpu import cells
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
+from mmsynth.field.kernels.cpu.cells import LANES
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
-CHUNK = 128  # rays
-LANES = 64
+CHUNK = LANES  # rays
+ENOUGH = CHUNK // 2  # samples of a round
 CAPACITY = CHUNK * MAX_SAMPLES_PER_RAY + 8  # samples of a chunk, and room for whole tiles
 _LONGEST_STEP = np.float32(LONGEST_STEP)
-_LEAST_ADVANCE = np.float32(LEAST_ADVANCE)
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
-_NO_CROSSING = np.float32(NO_CROSSING)
-_FACE_OVERSHOOT = np.float32(FACE_OVERSHOOT)
 _numbers_of_rays, _sums_of_rays = on_stack(types.float32, CHUNK), on_stack(types.float64, CHUNK)
 _states_of_rays, _flags_of_rays = on_stack(types.uint8, CHUNK), on_stack(types.boolean, CHUNK)
-_sums_of_lanes, _rays_of_lanes = on_stack(types.float64, LANES), on_stack(types.int32, LANES)
+_places_of_rays = on_stack(types.int32, CHUNK)
 
 
 @inlined()
@@ -73,56 +67,6 @@ def velocity(x, y, z, r, dx, dy, dz):  # type: ignore[no-untyped-def]
     return dx * across + ux * radial, dy * across + uy * radial, dz * across + uz * radial
 
 
-@part()
-def _advance(ox, oy, oz, dx, dy, dz, t, jitter, step, states, extent, contracted, skipped):  # type: ignore[no-untyped-def]
-    """t, position, distance from the centre, speed and state: at t where a surface may be there, else, with the state of a free cell,
-    behind that cell. skipped: whether the ray comes from one."""
-    grid = states.shape[0]
-    half, width = np.float32(0.5 * grid / extent), np.float32(2.0 * extent / grid)
-    x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-    cx, cy, cz, vx, vy, vz, r, speed = x, y, z, dx, dy, dz, np.float32(1.0), np.float32(1.0)
-    if contracted:
-        square = x * x + y * y + z * z
-        if square > np.float32(1.0):  # ``contract`` and ``velocity`` at once, of a direction of unit length
-            r = np.float32(math.sqrt(square))
-            inverse = np.float32(1.0) / r
-            k = (np.float32(2.0) - inverse) * inverse
-            along = (x * dx + y * dy + z * dz) * inverse
-            radial = along * (inverse * inverse - k) * inverse
-            cx, cy, cz = x * k, y * k, z * k
-            vx, vy, vz = dx * k + x * radial, dy * k + y * radial, dz * k + z * radial
-            # from the parts along the radius and across it: 1 - along² would be rounding alone far away
-            along *= inverse
-            px, py, pz = dx - x * along, dy - y * along, dz - z * along
-            outward = along * inverse
-            speed = np.float32(math.sqrt(k * k * (px * px + py * py + pz * pz) + outward * outward))
-    ix = min(max(int((cx + extent) * half), 0), grid - 1)
-    iy = min(max(int((cy + extent) * half), 0), grid - 1)
-    iz = min(max(int((cz + extent) * half), 0), grid - 1)
-    state = states[ix, iy, iz]
-    if state < OUTSIDE:
-        if skipped:  # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
-            t += jitter * step / speed
-            x, y, z = ox + dx * t, oy + dy * t, oz + dz * t
-            if contracted:
-                cx, cy, cz, _ = contract(x, y, z)
-            else:
-                cx, cy, cz = x, y, z
-        return t, cx, cy, cz, r, speed, state
-    leave = _NO_CROSSING
-    if abs(vx) > ALONG_FACE:
-        leave = min(leave, (np.float32(ix + (1 if vx > 0 else 0)) * width - extent - cx) / vx)
-    if abs(vy) > ALONG_FACE:
-        leave = min(leave, (np.float32(iy + (1 if vy > 0 else 0)) * width - extent - cy) / vy)
-    if abs(vz) > ALONG_FACE:
-        leave = min(leave, (np.float32(iz + (1 if vz > 0 else 0)) * width - extent - cz) / vz)
-    # the cell's certificate may reach beyond it
-    leave = max(leave, np.float32(state - OUTSIDE) / (half * speed * np.float32(2.0))) + _FACE_OVERSHOOT * step / speed
-    if contracted:
-        leave = min(leave, _LONGEST_STEP * max(r, np.float32(1.0)))
-    return max(t + leave, t * _LEAST_ADVANCE), cx, cy, cz, r, speed, state
-
-
 @inlined()
 def section_depth(before, after, first):  # type: ignore[no-untyped-def]
     """See ``reference.section_depth``, of -log Φ(s f) at both ends."""
@@ -139,62 +83,51 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     min_slope = np.float32(sampling.min_slope)
     origins, directions = rays.origins, rays.directions
     t_of, f_of, p_of, q_of, counts = store.t_of, store.f_of, store.p_of, store.q_of, store.counts
-    depths, densities = _sums_of_lanes(), _sums_of_lanes()
+    depths, densities = _sums_of_rays(), _sums_of_rays()
     block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
-    # lanes: the rays under way; a lane whose ray has ended takes the next ray that waits
     where, speed_of, reach_of = _numbers_of_rays(), _numbers_of_rays(), _numbers_of_rays()
     tau_of, state_of, skipped = _sums_of_rays(), _states_of_rays(), _flags_of_rays()
-    lanes, todo = _rays_of_lanes(), _rays_of_lanes()
+    todo, sampled, at = _places_of_rays(), _places_of_rays(), cells.of_lanes()
     for i in range(count):
         where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
-        counts[slot, i], tau_of[i], skipped[i] = 0, 0.0, False
-    going = 0
-    waiting = 0
-    used = np.int64(0)
-    while going > 0 or waiting < count:
+        counts[slot, i], tau_of[i], skipped[i], todo[i] = 0, 0.0, False, i
+    pending, used = np.int64(count), np.int64(0)
+    while pending > 0:
         n = np.int64(0)
-        pending = going
-        for i in range(going):
-            todo[i] = lanes[i]
-        while pending < LANES and waiting < count:
-            todo[pending] = waiting
-            pending += 1
-            waiting += 1
-        # all lanes go on by a cell in turn, and not one lane by all its cells: reading the states takes long, and so these reads overlap
-        while pending > 0:
-            left = 0
+        # rays without a sample go on by a cell. The last of them wait for the next round: alone they would take as long as many
+        while pending > 0 and n < ENOUGH:
+            some = np.int64(0)
             for a in range(pending):
                 i = todo[a]
-                o = begin + i
-                t = where[i]
-                if not t < rays.far[o]:  # NaN, too: where two samples fell into one place the step between them is not known
-                    if waiting < count:
-                        todo[left] = waiting
-                        left += 1
-                        waiting += 1
+                if not where[i] < rays.far[begin + i]:  # NaN, too: where two samples fell into one place the step between them is not known
                     continue
-                t, x, y, z, r, speed, state = _advance(
-                    origins[o, 0], origins[o, 1], origins[o, 2], directions[o, 0], directions[o, 1], directions[o, 2],
-                    t, rays.jitter[o], step, states, grid.extent, contracted, skipped[i],
-                )  # fmt: skip
-                where[i] = t
+                todo[some] = i
+                for axis in range(3):
+                    at[(cells.ORIGIN + axis) * CHUNK + some] = origins[begin + i, axis]
+                    at[(cells.DIRECTION + axis) * CHUNK + some] = directions[begin + i, axis]
+                at[cells.TIME * CHUNK + some] = where[i]
+                at[cells.ENTERS * CHUNK + some] = rays.jitter[begin + i] * step if skipped[i] else np.float32(0.0)
+                some += 1
+            cells.go_on(some, at, states, grid.extent, step)
+            pending = 0
+            for a in range(some):
+                i, state = todo[a], np.uint8(at[cells.STATE * CHUNK + a])
+                where[i] = at[cells.TIME * CHUNK + a]
                 skipped[i] = state >= OUTSIDE
-                if state >= OUTSIDE:
-                    todo[left] = i
-                    left += 1
-                elif t < rays.far[o]:
-                    speed_of[i], reach_of[i], state_of[i] = speed, r, state
-                    lanes[n] = i
-                    block[used + n, 0], block[used + n, 1], block[used + n, 2], block[used + n, 3] = x, y, z, np.float32(1.0)
+                if skipped[i]:
+                    todo[pending] = i
+                    pending += 1
+                elif where[i] < rays.far[begin + i]:
+                    speed_of[i], reach_of[i], state_of[i] = at[cells.SPEED * CHUNK + a], at[cells.REACH * CHUNK + a], state
+                    for axis in range(3):
+                        block[used + n, axis] = at[(cells.PLACE + axis) * CHUNK + a]
+                    block[used + n, 3] = np.float32(1.0)
+                    sampled[n] = i
                     n += 1
-            pending = left
-        if n == 0:
-            break
         surface_block(block[used:], hidden[used:], sdf[used:], n, grid, layers)
         negative_log_cdf(sdf[used:], n, sharpness, depths, densities)
-        going = 0
         for a in range(n):
-            i = lanes[a]
+            i = sampled[a]
             k = counts[slot, i]
             value = sdf[used + a]
             t = where[i]
@@ -220,8 +153,8 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
             if contracted:
                 jump = min(jump, _LONGEST_STEP * max(reach_of[i], np.float32(1.0)))
             where[i] = t + jump
-            lanes[going] = i
-            going += 1
+            todo[pending] = i
+            pending += 1
         used += n
     store.samples[slot, 0] = used
     return used

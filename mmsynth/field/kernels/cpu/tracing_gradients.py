@@ -15,7 +15,7 @@ from mmsynth.field.kernels.cpu.blocks import (
     surface_block_positions,
 )
 from mmsynth.field.kernels.cpu.jit import allocating_kernel, inlined, kernel, part
-from mmsynth.field.kernels.cpu.marching import CHUNK, LANES
+from mmsynth.field.kernels.cpu.marching import CHUNK
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
@@ -76,8 +76,8 @@ def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, s
 @part()
 def samples_backward(block, hidden, g, samples, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
     """``surface_block_backward`` of many samples, a part at a time."""
-    for used in range(0, samples, LANES):
-        n = np.int64(min(LANES, samples - used))
+    for used in range(0, samples, CHUNK):
+        n = np.int64(min(CHUNK, samples - used))
         surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
 
 
