@@ -91,7 +91,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     for i in range(count):
         where[i] = rays.near[begin + i] + rays.jitter[begin + i] * step
         counts[slot, i], tau_of[i], skipped[i], todo[i] = 0, 0.0, False, i
-    pending, used = np.int64(count), np.int64(0)
+    pending, used = count, np.int64(0)
     while pending > 0:
         n = np.int64(0)
         # rays without a sample go on by a cell. The last of them wait for the next round: alone they would take as long as many
