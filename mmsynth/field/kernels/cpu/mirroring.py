@@ -66,7 +66,7 @@ def _met(begin, end, share, behind, row_of, place_of):  # type: ignore[no-untype
         for which in range(2):
             row, place = o if which == 0 else behind[o], 2 * (o - begin) + which
             place_of[place] = -1
-            if row >= 0 and share[row] > _ZERO:
+            if row >= 0 and not share[row] <= _ZERO:  # what is NaN is seen
                 row_of[n], place_of[place] = row, n
                 n += 1
     return n
@@ -322,13 +322,6 @@ def _total(values, n):  # type: ignore[no-untyped-def]
     return total
 
 
-@part()
-def _set_zero(values, parts, n):  # type: ignore[no-untyped-def]
-    for j in range(parts):
-        for i in range(n):
-            values[j * _S + i] = _ZERO
-
-
 @part(fastmath=_FAST)
 def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measured, g, out):  # type: ignore[no-untyped-def]
     """``mirror_backward`` of at most ``CHUNK`` rays; gradients of the lamps are added to those of the chunk."""
@@ -343,10 +336,10 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
             row = o if which == 0 else behind[o]
             out.share[row], out.normals[row], out.material[row] = _ZERO, _ZERO, _ZERO
     _read(n, row_of, mirrors, polarized, of, raw, soft, gate)
-    _set_zero(into, 9, lanes)
+    into[:] = _ZERO
     if polarized:
         _surround(lanes, of, soft, terms)
-        _set_zero(sums, 5, lanes)
+        sums[:] = _ZERO
         for m in range(max(first, bright), last):
             for which in range(2):
                 i = place_of[2 * (measured.ray[m] - ray0 - begin) + which]
@@ -360,7 +353,7 @@ def mirror_rays_backward(begin, end, ray0, chunk, lamps, mirrors, behind, measur
     for k in range(lamps.position.shape[0]):
         _read_material(_VISIBLE, _VISIBLE + k, n, row_of, mirrors, raw, soft, gate)
         _reflect_lamp(lanes, lamps.position[k, 0], lamps.position[k, 1], lamps.position[k, 2], of, soft, gate, polarized, terms)
-        _set_zero(raw, 1, lanes)  # pulls
+        raw[:] = _ZERO  # pulls
         for m in range(first, last):
             column = measured.output[m]
             pull, seen = g[m] * lamps.spectrum[k, column], _ZERO
