@@ -37,6 +37,15 @@ _FACE_OVERSHOOT, _ALONG_FACE, _OUTSIDE = _f(FACE_OVERSHOOT), _f(ALONG_FACE), _f(
 
 
 @inlined()
+def _contraction(x, y, z, border):  # type: ignore[no-untyped-def]
+    """See ``marching.contract``: distance from the centre, one over it, factor of the position; 1 within the border."""
+    square = x * x + y * y + z * z
+    r = _f(math.sqrt(square)) if square > border else _ONE
+    inverse = _ONE / r
+    return r, inverse, (_TWO - inverse) * inverse
+
+
+@inlined()
 def _to_face(cell, place, velocity, width, extent):  # type: ignore[no-untyped-def]
     """How long until the next face of a cell across an axis."""
     face = (cell + (_ONE if velocity > _ZERO else _ZERO)) * width - extent
@@ -55,10 +64,7 @@ def go_on(n, of, states, extent, step):  # type: ignore[no-untyped-def]
     for i in range(lanes):
         dx, dy, dz, t = of[DIRECTION * _L + i], of[(DIRECTION + 1) * _L + i], of[(DIRECTION + 2) * _L + i], of[TIME * _L + i]
         x, y, z = of[ORIGIN * _L + i] + dx * t, of[(ORIGIN + 1) * _L + i] + dy * t, of[(ORIGIN + 2) * _L + i] + dz * t
-        square = x * x + y * y + z * z
-        r = _f(math.sqrt(square)) if square > border else _ONE  # at 1 nothing of what follows changes anything
-        inverse = _ONE / r
-        k = (_TWO - inverse) * inverse
+        r, inverse, k = _contraction(x, y, z, border)
         along = (x * dx + y * dy + z * dz) * inverse
         radial = along * (inverse * inverse - k) * inverse
         # from the parts along the radius and across it: 1 - along² would be rounding alone far away
@@ -74,7 +80,7 @@ def go_on(n, of, states, extent, step):  # type: ignore[no-untyped-def]
         of[_VELOCITY * _L + i] = dx * k + x * radial
         of[(_VELOCITY + 1) * _L + i] = dy * k + y * radial
         of[(_VELOCITY + 2) * _L + i] = dz * k + z * radial
-        of[REACH * _L + i], of[SPEED * _L + i] = r, speed if square > border else _ONE
+        of[REACH * _L + i], of[SPEED * _L + i] = r, speed if r > _ONE else _ONE
         of[_CELL * _L + i], of[(_CELL + 1) * _L + i], of[(_CELL + 2) * _L + i] = _f(ix), _f(iy), _f(iz)
         cells[i] = (ix * np.int32(grid) + iy) * np.int32(grid) + iz
     for i in range(n):
@@ -94,8 +100,6 @@ def go_on(n, of, states, extent, step):  # type: ignore[no-untyped-def]
         # a ray enters a shell at a random place, so that samples do not all lie on the faces of cells
         entered = t + of[ENTERS * _L + i] / speed
         x, y, z = of[ORIGIN * _L + i] + dx * entered, of[(ORIGIN + 1) * _L + i] + dy * entered, of[(ORIGIN + 2) * _L + i] + dz * entered
-        square = x * x + y * y + z * z
-        inverse = _ONE / (_f(math.sqrt(square)) if square > border else _ONE)
-        k = (_TWO - inverse) * inverse
+        _, _, k = _contraction(x, y, z, border)
         of[PLACE * _L + i], of[(PLACE + 1) * _L + i], of[(PLACE + 2) * _L + i] = x * k, y * k, z * k
         of[TIME * _L + i] = behind if state >= _OUTSIDE else entered

@@ -29,14 +29,13 @@ from mmsynth.field.kernels.constants import (
 )
 from mmsynth.field.kernels.cpu import cells
 from mmsynth.field.kernels.cpu.blocks import encode_block, surface_block
-from mmsynth.field.kernels.cpu.cells import LANES
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
 from mmsynth.field.kernels.cpu.logistic import negative_log_cdf
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
 
-CHUNK = LANES  # rays
-ENOUGH = CHUNK // 2  # samples of a round
+CHUNK = cells.LANES  # rays
+_ENOUGH = CHUNK // 2  # samples of a round
 CAPACITY = CHUNK * MAX_SAMPLES_PER_RAY + 8  # samples of a chunk, and room for whole tiles
 _LONGEST_STEP = np.float32(LONGEST_STEP)
 _LEAST_WEIGHT = np.float32(LEAST_WEIGHT)
@@ -95,7 +94,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     while pending > 0:
         n = np.int64(0)
         # rays without a sample go on by a cell. The last of them wait for the next round: alone they would take as long as many
-        while pending > 0 and n < ENOUGH:
+        while pending > 0 and n < _ENOUGH:
             some = np.int64(0)
             for a in range(pending):
                 i = todo[a]
