@@ -16,12 +16,14 @@ from mmsynth.field.kernels.cpu.matrices import whole
 from mmsynth.field.kernels.cpu.stack import on_stack
 
 AT_ONCE = 64  # positions
+LOWER, UPPER = 4, 5  # parts of weights, behind those of the edges
 _LANES = 16  # numbers in a vector
 _ROW = np.uint32(4 * FEATURES)  # bytes
 _P1 = np.uint32(HASH_PRIMES[1])
 _P2 = np.uint32(HASH_PRIMES[2])
 of_axes = on_stack(types.float32, 3 * AT_ONCE)
 of_corners = on_stack(types.float32, 8 * AT_ONCE)
+of_weights = on_stack(types.float32, 6 * AT_ONCE)
 places_of_corners = on_stack(types.uint32, 8 * AT_ONCE)
 
 
@@ -50,6 +52,12 @@ def _set(out, i, a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     out[4 * AT_ONCE + i], out[5 * AT_ONCE + i], out[6 * AT_ONCE + i], out[7 * AT_ONCE + i] = e, f, g, h
 
 
+@inlined()
+def in_order(resolution, rows):  # type: ignore[no-untyped-def]
+    """Whether a level has a row for each corner: then corners that follow each other along z do so in the table."""
+    return (np.int64(resolution) + 1) ** 3 <= rows
+
+
 @part(fastmath=True)
 def find_corners(n, unit, resolution, rows, places, fractions):  # type: ignore[no-untyped-def]
     """Where the rows of the corners begin in the table of a level [bytes], uint32, and where in their cells positions are.
@@ -57,7 +65,7 @@ def find_corners(n, unit, resolution, rows, places, fractions):  # type: ignore[
     resolution: cells per axis. rows: of the level.
     """
     cells, last = np.float32(resolution), np.int32(resolution - 1)
-    if (np.int64(resolution) + 1) ** 3 <= rows:
+    if in_order(resolution, rows):
         side = np.uint32(resolution + 1)
         step_x, step_y, step_z = _ROW * side * side, _ROW * side, _ROW
         for i in range(whole(n, _LANES)):
@@ -93,13 +101,13 @@ def same_cell(places, i, j):  # type: ignore[no-untyped-def]
 
 @part(fastmath=True)
 def find_weights(n, fractions, weights):  # type: ignore[no-untyped-def]
-    """Trilinear weights of the corners."""
+    """Trilinear weights: of the four edges of a cell that run along z, and of their lower and upper ends."""
     one = np.float32(1.0)
     for i in range(whole(n, _LANES)):
         fx, fy, fz = fractions[i], fractions[AT_ONCE + i], fractions[2 * AT_ONCE + i]
-        gx, gy, gz = one - fx, one - fy, one - fz
-        a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
-        _set(weights, i, a * gz, a * fz, b * gz, b * fz, c * gz, c * fz, d * gz, d * fz)
+        gx, gy = one - fx, one - fy
+        weights[i], weights[AT_ONCE + i], weights[2 * AT_ONCE + i], weights[3 * AT_ONCE + i] = gx * gy, gx * fy, fx * gy, fx * fy
+        weights[LOWER * AT_ONCE + i], weights[UPPER * AT_ONCE + i] = one - fz, fz
 
 
 @part(fastmath=True)

@@ -9,15 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import types
 
 from mmsynth.field.kernels.constants import DRAW_JITTER, DRAW_PIXEL, DRAW_TILE, PURPOSE_STRIDE, WORD
 from mmsynth.field.kernels.cpu.arrays import as_arrays, as_compiled
 from mmsynth.field.kernels.cpu.jit import inlined, kernel, part
+from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take, take_all
 from mmsynth.field.kernels.parameters import Cameras, Drawing, Drawn, Frames, Measured, Modalities, Selection
 
 CHUNK = 64  # rays
 _u, _f = np.uint32, np.float32
+_of_rays = on_stack(types.int64, CHUNK)
 _ZERO, _ONE, _TWO, _THREE, _SIX = _f(0.0), _f(1.0), _f(2.0), _f(3.0), _f(6.0)
 
 
@@ -36,17 +39,21 @@ def _bits(key, number, purpose):  # type: ignore[no-untyped-def]
     return np.int64(_scramble(_u(mixed ^ _u(np.int64(key[1]) + purpose * PURPOSE_STRIDE))))
 
 
-@inlined()
-def _first_above(ascending, begin, end, value):  # type: ignore[no-untyped-def]
-    """The first of a range whose number is larger than ``value``."""
+@part()
+def _first_above(ascending, begin, end, values, n, found):  # type: ignore[no-untyped-def]
+    """The first of a range whose number is larger, for each of n values: all of them a step at a time, so that none waits for another."""
     length = end - begin
+    for i in range(n):
+        found[i] = begin
     while length > 1:
         half = length // 2
-        # all ones where it is larger: without a branch that nobody could predict, which LLVM would make of a condition
-        larger = (np.int64(value) - np.int64(ascending[begin + half - 1])) >> 63
-        begin += half & ~larger
+        for i in range(n):
+            # all ones where it is larger
+            larger = (values[i] - np.int64(ascending[found[i] + half - 1])) >> 63
+            found[i] += half & ~larger
         length -= half
-    return begin + (1 if length > 0 and ascending[begin] <= value else 0)
+    for i in range(n):
+        found[i] += 1 if length > 0 and ascending[found[i]] <= values[i] else 0
 
 
 @inlined()
@@ -120,83 +127,119 @@ def drawing_tasks(to_fill):  # type: ignore[no-untyped-def]
 
 @part()
 def draw_chunk(chunk, to_fill):  # type: ignore[no-untyped-def]
-    """A task: some of the rays."""
-    frames, cameras, modalities, selection, rays, key = to_fill.drawing
-    n, rays_begin, numbers_begin, n_drawn = np.int64(0), np.int64(0), np.int64(0), 0
-    for count in rays:
-        n_drawn += count > 0
-    out_origins, out_directions, out_jitter, out_alpha, out_weight, out_tile, out_frame, measured = to_fill.drawn
-    target, of_ray, output, axes, level, saturation, weight = measured
-    axes_begin = target.shape[0] - axes.shape[0]
-    for ray in range(chunk * CHUNK, min(out_jitter.shape[0], (chunk + 1) * CHUNK)):
-        while ray >= rays_begin + rays[n]:
-            rays_begin, numbers_begin, n = rays_begin + rays[n], numbers_begin + rays[n] * modalities.values[n], n + 1
-        tile = _first_above(
-            selection.ends, np.int64(modalities.first_tile[n]), np.int64(modalities.first_tile[n + 1]) - 1, _bits(key, ray, DRAW_TILE)
-        )
-        frame = _first_above(frames.first_tile, np.int64(modalities.first_frame[n]), np.int64(modalities.first_frame[n + 1]), tile) - 1
-        camera = frames.camera[frame]
-        width, tile_width = np.int64(cameras.width[camera]), np.int64(modalities.tile_width[n])
-        tile_height = np.int64(modalities.tile_height[n])
-        tiles_across, local = (width + tile_width - 1) // tile_width, tile - frames.first_tile[frame]
+    """A task: some of the rays, those of each modality together."""
+    rays, values = to_fill.drawing.rays, to_fill.drawing.modalities.values
+    n, rays_begin, numbers_begin = np.int64(0), np.int64(0), np.int64(0)
+    first, end = chunk * CHUNK, min(to_fill.drawn.jitter.shape[0], (chunk + 1) * CHUNK)
+    while first < end:
+        while first >= rays_begin + rays[n]:
+            rays_begin, numbers_begin, n = rays_begin + rays[n], numbers_begin + rays[n] * values[n], n + 1
+        some = min(end, rays_begin + rays[n]) - first
+        _draw_some(n, first, some, numbers_begin + (first - rays_begin) * values[n], to_fill)
+        first += some
+
+
+@part()
+def _draw_some(n, first, count, first_number, to_fill):  # type: ignore[no-untyped-def]
+    """``count`` rays of modality n from ``first`` on, whose numbers begin at ``first_number``. Each thing of all rays, and then the next: a
+    ray waits for memory at every turn, and others do meanwhile."""
+    modalities, selection, rays, key = to_fill.drawing[2:]
+    drawn, measured = to_fill.drawn, to_fill.drawn.measured
+    bits, tile, frame, row, column = _of_rays(), _of_rays(), _of_rays(), _of_rays(), _of_rays()
+    for i in range(count):
+        bits[i] = _bits(key, first + i, DRAW_TILE)
+    _first_above(selection.ends, np.int64(modalities.first_tile[n]), np.int64(modalities.first_tile[n + 1]) - 1, bits, count, tile)
+    _find_pixels(n, first, count, to_fill.drawing, bits, tile, frame, row, column)
+    n_drawn = 0
+    for of_modality in rays:
+        n_drawn += of_modality > 0
+    values = np.int64(modalities.values[n])
+    of_all = _f(n_drawn * rays[n] * values)
+    for i in range(count):
+        ray = first + i
+        drawn.jitter[ray] = _f(_bits(key, ray, DRAW_JITTER) >> 8) * _f(2.0**-24)
+        drawn.tile[ray], drawn.ray_weight[ray] = tile[i], selection.weight[tile[i]]
+        for j in range(values):
+            number = first_number + i * values + j
+            measured.ray[number], drawn.frame[number] = ray, frame[i]
+            measured.level[number], measured.saturation[number] = modalities.level[n], modalities.saturation[n]
+            measured.weight[number] = drawn.ray_weight[ray] / of_all
+    _find_directions(first, count, to_fill, frame, row, column)
+    _read(n, first, count, first_number, to_fill, frame, row, column)
+
+
+@part()
+def _find_pixels(n, first, count, drawing, bits, tile, frame, row, column):  # type: ignore[no-untyped-def]
+    """Frame, row and column of each of some rays of modality n; bits: scratch."""
+    frames, cameras, modalities, selection, _, key = drawing
+    _first_above(frames.first_tile, np.int64(modalities.first_frame[n]), np.int64(modalities.first_frame[n + 1]), tile, count, frame)
+    tile_width, tile_height, first_word = np.int64(modalities.tile_width[n]), np.int64(modalities.tile_height[n]), selection.first_word[n]
+    for i in range(count):
+        bits[i] = (_bits(key, first + i, DRAW_PIXEL) * np.int64(selection.pixels[tile[i]])) >> 32
+    if first_word >= 0:
+        per_tile = (tile_width * tile_height) // WORD
+        for i in range(count):
+            bits[i] = _set_bit(selection.words, first_word + (tile[i] - np.int64(modalities.first_tile[n])) * per_tile, bits[i])
+    for i in range(count):
+        frame[i] -= 1
+        width, local = np.int64(cameras.width[frames.camera[frame[i]]]), tile[i] - frames.first_tile[frame[i]]
+        tiles_across = (width + tile_width - 1) // tile_width
         down, across = local // tiles_across, local % tiles_across
-        kth = (_bits(key, ray, DRAW_PIXEL) * np.int64(selection.pixels[tile])) >> 32
-        columns, first_word = min(tile_width, width - across * tile_width), selection.first_word[n]
-        if first_word >= 0:
-            per_tile = (tile_width * tile_height) // WORD
-            kth = _set_bit(selection.words, first_word + (tile - np.int64(modalities.first_tile[n])) * per_tile, kth)
-            columns = tile_width
-        row, column = down * tile_height + kth // columns, across * tile_width + kth % columns
+        columns = tile_width if first_word >= 0 else min(tile_width, width - across * tile_width)
+        row[i], column[i] = down * tile_height + bits[i] // columns, across * tile_width + bits[i] % columns
 
-        x, y, z = _in_camera(cameras, camera, row, column)
-        turn, from_ = frames.rotation[frame], frames.origin[frame]
-        dx = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
-        dy = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
-        dz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
-        out_directions[ray, 0], out_directions[ray, 1], out_directions[ray, 2] = dx, dy, dz
-        out_origins[ray, 0], out_origins[ray, 1], out_origins[ray, 2] = from_[0], from_[1], from_[2]
-        out_jitter[ray] = _f(_bits(key, ray, DRAW_JITTER) >> 8) * _f(2.0**-24)
-        out_tile[ray] = tile
-        out_weight[ray] = selection.weight[tile]
 
-        values, kind, stride = np.int64(modalities.values[n]), frames.kind[frame], np.int64(frames.stride[frame])
-        at, alpha = frames.start[frame] + (row * width + column) * stride, _ONE
+@part()
+def _find_directions(first, count, to_fill, frame, row, column):  # type: ignore[no-untyped-def]
+    """Origins and directions of some rays."""
+    frames, cameras, directions, origins = to_fill.drawing.frames, to_fill.drawing.cameras, to_fill.drawn.directions, to_fill.drawn.origins
+    for i in range(count):
+        ray = first + i
+        x, y, z = _in_camera(cameras, frames.camera[frame[i]], row[i], column[i])
+        turn, from_ = frames.rotation[frame[i]], frames.origin[frame[i]]
+        directions[ray, 0] = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+        directions[ray, 1] = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
+        directions[ray, 2] = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+        origins[ray, 0], origins[ray, 1], origins[ray, 2] = from_[0], from_[1], from_[2]
+
+
+@part()
+def _read(n, first, count, first_number, to_fill, frame, row, column):  # type: ignore[no-untyped-def]
+    """What was measured along some rays of modality n, and by what."""
+    frames, cameras, modalities = to_fill.drawing.frames, to_fill.drawing.cameras, to_fill.drawing.modalities
+    directions, alphas, measured = to_fill.drawn.directions, to_fill.drawn.alpha, to_fill.drawn.measured
+    values, mosaic, analyser = np.int64(modalities.values[n]), np.int64(modalities.pattern_first[n]), np.int64(modalities.analyser_first[n])
+    high, wide = np.int64(modalities.pattern_height[n]), np.int64(modalities.pattern_width[n])
+    axes, axes_begin = measured.axes, len(measured.target) - len(measured.axes)
+    for i in range(count):
+        kind, stride = frames.kind[frame[i]], np.int64(frames.stride[frame[i]])
+        at, alpha = frames.start[frame[i]] + (row[i] * cameras.width[frames.camera[frame[i]]] + column[i]) * stride, _ONE
         if stride > values:
             alpha = _decoded(frames, kind, at + values)
-            out_alpha[ray] = alpha
+            alphas[first + i] = alpha
         else:
-            out_alpha[ray] = modalities.opaque[n]
-        mosaic, analyser = np.int64(modalities.pattern_first[n]), np.int64(modalities.analyser_first[n])
-        share = out_weight[ray] / _f(n_drawn * rays[n] * values)
+            alphas[first + i] = modalities.opaque[n]
+        for j in range(values):
+            measured.target[first_number + i * values + j] = _decoded(frames, kind, at + j) * alpha
+    for i in range(count):
+        ray, turn = first + i, frames.rotation[frame[i]]
         if analyser >= 0:
+            dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
             along = turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz
             rx, ry, rz = turn[0, 0] - along * dx, turn[1, 0] - along * dy, turn[2, 0] - along * dz
             length = _f(math.sqrt(rx * rx + ry * ry + rz * rz))
             rx, ry, rz = rx / length, ry / length, rz / length
             ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
         for j in range(values):
-            number = numbers_begin + (ray - rays_begin) * values + j
-            channel = np.int64(j)
+            number, channel = first_number + i * values + j, np.int64(j)
             if mosaic >= 0:
-                pattern_width = np.int64(modalities.pattern_width[n])
-                place = (row % np.int64(modalities.pattern_height[n])) * pattern_width + column % pattern_width
-                channel = np.int64(modalities.pattern[mosaic + place])
-            target[number] = _decoded(frames, kind, at + j) * alpha
-            of_ray[number] = ray
-            out_frame[number] = frame
-            level[number] = modalities.level[n]
-            saturation[number] = modalities.saturation[n]
-            weight[number] = share
-            output[number] = modalities.output[n]
+                channel = np.int64(modalities.pattern[mosaic + row[i] % high * wide + column[i] % wide])
+            measured.output[number] = modalities.output[n]
             if analyser >= 0:
-                e, cos, sin = (
-                    number - axes_begin,
-                    modalities.analysers[analyser + channel, 0],
-                    modalities.analysers[analyser + channel, 1],
-                )
+                cos, sin, e = modalities.analysers[analyser + channel, 0], modalities.analysers[analyser + channel, 1], number - axes_begin
                 axes[e, 0], axes[e, 1], axes[e, 2] = cos * rx + sin * ux, cos * ry + sin * uy, cos * rz + sin * uz
             else:
-                output[number] += channel
+                measured.output[number] += channel
 
 
 @kernel

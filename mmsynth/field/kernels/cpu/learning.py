@@ -27,6 +27,7 @@ from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take, tell, wait
 from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
+from mmsynth.field.kernels.cpu.units import add_of_units
 from mmsynth.field.kernels.parameters import Rays, ShadedRays
 
 _f = np.float32
@@ -37,14 +38,14 @@ _of_rays = on_stack(types.float32, CHUNK)
 
 class TableStore(NamedTuple):
     """What tables learn from, a slot per chunk of rays: rows (see ``blocks``) of the samples that have a gradient, and of the sections; how
-    many; the gradients of the surface's weights."""
+    many; what the gradients of the surface's weights follow from."""
 
     block: np.ndarray
     samples: np.ndarray
     s_block: np.ndarray
     sections: np.ndarray
-    turned_out: np.ndarray
-    output_out: np.ndarray
+    pulled_out: np.ndarray
+    bias_out: np.ndarray
 
 
 class WeightGradients(NamedTuple):
@@ -90,7 +91,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
         behind[i] = CHUNK + i if weight[1, i] != _ZERO else -1
         opacity[i] = weight[0, i] + weight[1, i]
     taps.used[chunk, 0] = 0
-    taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
+    taps.pulled_out[chunk], taps.bias_out[chunk] = _ZERO, _ZERO
     shines, trains = len(lamps.position) > 0, view.trains_geometry[begin:end]
     factor = eikonal.weight / _f(max(asked, 1))
     if shines:
@@ -142,19 +143,19 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             for which in range(2):
                 g_share[which * CHUNK + i] += pull
     rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
-    kept.turned_out[chunk], kept.output_out[chunk] = _ZERO, _ZERO
+    kept.pulled_out[chunk], kept.bias_out[chunk] = _ZERO, _ZERO
     n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
     samples_backward(
-        kept.block[chunk], store.hidden[slot], store.sdf[slot], n, grid.active, surface, kept.turned_out[chunk], kept.output_out[chunk]
+        kept.block[chunk], store.gates[slot], store.sdf[slot], n, grid.active, surface, kept.pulled_out[chunk], kept.bias_out[chunk]
     )
     return loss
 
 
 @part()
 def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-def]
-    """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Hidden units and
+    """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Gates and
     gradients of these samples move to the front of their arrays."""
-    sdf, block, hidden, out = store.sdf[slot], store.block[slot], store.hidden[slot], kept.block[chunk]
+    sdf, block, gates, out = store.sdf[slot], store.block[slot], store.gates[slot], kept.block[chunk]
     n = np.int64(0)
     for i in range(store.samples[slot, 0]):
         if sdf[i] == _ZERO:
@@ -162,8 +163,8 @@ def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-
         for j in range(width):
             out[n, j] = block[i, j]
         if n < i:
-            for j in range(hidden.shape[1]):
-                hidden[n, j] = hidden[i, j]
+            for j in range(gates.shape[1]):
+                gates[n, j] = gates[i, j]
             sdf[n] = sdf[i]
         n += 1
     kept.samples[chunk, 0] = n
@@ -217,14 +218,15 @@ def learn_rays(  # type: ignore[no-untyped-def]
 
 
 @part()
-def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
+def _add_weights(chunks, tasks, network, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
     """Add to the gradients of weights, biases and lamps what each chunk found: the sum of all that they are then, finite if each is."""
     g, units = gradients, gradients.hidden.shape[0]
-    add_sum(kept.turned_out[:chunks], g.hidden.T)
-    add_sum(taps.turned_out[:tasks], g.hidden.T)
-    for parts in (kept.output_out[:chunks], taps.output_out[:tasks]):
-        add_sums(parts, g.output[:units])
-        add_sums(parts[:, parts.shape[1] - 1 :], g.output[units:])  # behind the units of whole tiles
+    pulled = kept.pulled_out[0]
+    add_sum(kept.pulled_out[1:chunks], pulled)
+    add_sum(taps.pulled_out[:tasks], pulled)
+    add_of_units(pulled, network.hidden, network.output, g.hidden, g.output)
+    for parts in (kept.bias_out[:chunks], taps.bias_out[:tasks]):
+        add_sums(parts, g.output[units:])
     add_sum(shaded.first_out[:chunks], g.first)
     add_sums(shaded.first_bias_out[:chunks], g.first_bias)
     add_sum(shaded.second_out[:chunks], g.second)
@@ -255,8 +257,8 @@ def _add_weights(chunks, tasks, kept, taps, shaded, out, rows, used, spectrum, g
 
 @kernel
 def finish(  # type: ignore[no-untyped-def]
-    next_task, done, rays, points, grid, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient, gradients, sums,
-    places, numbers,
+    next_task, done, rays, points, grid, network, appearance, kept, taps, shaded, out, rows, used, spectrum, gradient, a_gradient,
+    gradients, sums, places, numbers,
 ):  # fmt: skip
     """Add what ``learn_rays`` found to the gradients of both tables, a task for each level, and of all else, ``WeightGradients``, and then
     take a step of Adam where all are finite: until no task is left.
@@ -272,7 +274,7 @@ def finish(  # type: ignore[no-untyped-def]
         if level >= appearance.active:
             break
         if task < 0:
-            sums[1] += _add_weights(chunks, chunks + point_chunks, kept, taps, shaded, out, rows, used, spectrum, gradients)
+            sums[1] += _add_weights(chunks, chunks + point_chunks, network, kept, taps, shaded, out, rows, used, spectrum, gradients)
         else:
             for chunk in range(chunks):
                 if level < 0:

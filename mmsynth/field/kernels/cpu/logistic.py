@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from mmsynth.field.kernels.cpu.jit import part
+from mmsynth.field.kernels.cpu.jit import inlined, part
 
 _LOG2E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 0.6931471803691238, 1.9082149292705877e-10
 _MOST = 700.0  # e^-700 is a number still
@@ -60,23 +60,33 @@ def negative_log_cdf(values, n, sharpness, out, density):  # type: ignore[no-unt
         density[i] = (1.0 if x > 0.0 else e) / (1.0 + e)
 
 
+@inlined()
+def _softplus(x):  # type: ignore[no-untyped-def]
+    """See ``softplus_of``."""
+    one, two, zero = _f(1.0), _f(2.0), _f(0.0)
+    size = min(abs(x), _MOST_SINGLE)
+    k = np.int32(-np.int32(size * _LOG2E_SINGLE + _f(0.5)))
+    r = (-size - _f(k) * _LN2_HIGH_SINGLE) - _f(k) * _LN2_LOW_SINGLE
+    e = _EXP_SINGLE[7]
+    for j in range(6, -1, -1):
+        e = e * r + _EXP_SINGLE[j]
+    e *= _power_of_two(k)
+    z = e / (two + e)
+    square = z * z
+    log1p = _ATANH_SINGLE[6]
+    for j in range(5, -1, -1):
+        log1p = log1p * square + _ATANH_SINGLE[j]
+    return max(x, zero) + z * log1p + zero * x, (one if x > zero else e) / (one + e) + zero * x
+
+
 @part(fastmath={"contract", "nsz"})
 def softplus(values, n, out, slope):  # type: ignore[no-untyped-def]
-    """log(1 + e^x) of n numbers and its slope, 1 / (1 + e^-x), in single precision; see ``negative_log_cdf``."""
-    one, two, zero = _f(1.0), _f(2.0), _f(0.0)
+    """``softplus_of`` n numbers at once."""
     for i in range(n):
-        x = values[i]
-        size = min(abs(x), _MOST_SINGLE)
-        k = np.int32(-np.int32(size * _LOG2E_SINGLE + _f(0.5)))
-        r = (-size - _f(k) * _LN2_HIGH_SINGLE) - _f(k) * _LN2_LOW_SINGLE
-        e = _EXP_SINGLE[7]
-        for j in range(6, -1, -1):
-            e = e * r + _EXP_SINGLE[j]
-        e *= _power_of_two(k)
-        z = e / (two + e)
-        square = z * z
-        log1p = _ATANH_SINGLE[6]
-        for j in range(5, -1, -1):
-            log1p = log1p * square + _ATANH_SINGLE[j]
-        out[i] = max(x, zero) + z * log1p + zero * x
-        slope[i] = (one if x > zero else e) / (one + e) + zero * x
+        out[i], slope[i] = _softplus(values[i])
+
+
+@part(fastmath={"contract", "nsz"})
+def softplus_of(x):  # type: ignore[no-untyped-def]
+    """log(1 + e^x) and its slope, 1 / (1 + e^-x), in single precision; see ``negative_log_cdf``."""
+    return _softplus(x)

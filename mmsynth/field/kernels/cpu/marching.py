@@ -83,7 +83,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
     origins, directions = rays.origins, rays.directions
     t_of, f_of, p_of, q_of, counts = store.t_of, store.f_of, store.p_of, store.q_of, store.counts
     depths, densities = _sums_of_rays(), _sums_of_rays()
-    block, hidden, sdf = store.block[slot], store.hidden[slot], store.sdf[slot]
+    block, gates, sdf = store.block[slot], store.gates[slot], store.sdf[slot]
     where, speed_of, reach_of = _numbers_of_rays(), _numbers_of_rays(), _numbers_of_rays()
     tau_of, state_of, skipped = _sums_of_rays(), _states_of_rays(), _flags_of_rays()
     todo, sampled, at = _places_of_rays(), _places_of_rays(), cells.of_lanes()
@@ -123,7 +123,7 @@ def march_rays(begin, count, slot, rays, states, sampling, grid, layers, store):
                     block[used + n, 3] = np.float32(1.0)
                     sampled[n] = i
                     n += 1
-        surface_block(block[used:], hidden[used:], sdf[used:], n, grid, layers)
+        surface_block(block[used:], gates[used:], sdf[used:], n, grid, layers)
         negative_log_cdf(sdf[used:], n, sharpness, depths, densities)
         for a in range(n):
             i = sampled[a]

@@ -19,8 +19,8 @@ from mmsynth.field.kernels.cpu.stack import on_stack
 TILE_ROWS, TILE_COLS = 4, 16
 # Sums of four tiles at once fit into AVX-512's 32 registers of 16 numbers. AVX2 has 16 of 8, half of them for one tile: more would spill,
 # at a third of the speed.
-_FOUR_AT_ONCE = bool(binding.get_host_cpu_features().get("avx512f"))
-_VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
+FOUR_AT_ONCE = bool(binding.get_host_cpu_features().get("avx512f"))
+VECTOR = ir.VectorType(ir.FloatType(), TILE_COLS)
 _TOTALS = 64  # columns that are summed at once
 _totals = on_stack(types.float32, _TOTALS)
 _BYTE, _I32, _I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
@@ -41,6 +41,32 @@ def element(context, builder, kind, array, i, j):  # type: ignore[no-untyped-def
     return builder.gep(data, [builder.add(builder.mul(i, strides[0]), builder.mul(j, strides[1]))]), *strides
 
 
+def after(builder, address, stride, count, kind):  # type: ignore[no-untyped-def]
+    """The address of a number, or of a vector, so many strides behind an address in bytes."""
+    return builder.bitcast(builder.gep(address, [builder.mul(stride, count)]), kind.as_pointer())
+
+
+def vectors_at(builder, address, vectors):  # type: ignore[no-untyped-def]
+    """Addresses of the vectors of columns that lie one after the other at an address in bytes."""
+    return [builder.bitcast(builder.gep(address, [ir.Constant(_I64, 4 * TILE_COLS * v)]), VECTOR.as_pointer()) for v in range(vectors)]
+
+
+def add_products(builder, left, right, inner, sums):  # type: ignore[no-untyped-def]
+    """Add to a tile of sums, [rows][vectors] of addresses, what ``inner`` columns of a times rows of b are. left: address in a, strides
+    of rows and columns; right: address in b, stride of rows. Sums stay in registers."""
+    a, down, along = left
+    b, onward = right
+    with cgutils.for_range(builder, inner) as loop:
+        begin = builder.gep(b, [builder.mul(onward, loop.index)])
+        factors = [builder.load(at, align=4) for at in vectors_at(builder, begin, len(sums[0]))]
+        values = builder.gep(a, [builder.mul(along, loop.index)])
+        for r, line in enumerate(sums):
+            value = splat(builder, builder.load(after(builder, values, down, ir.Constant(_I64, r), ir.FloatType())), VECTOR)
+            for factor, total in zip(factors, line, strict=True):
+                product = builder.fmul(value, factor, flags=("contract",))
+                builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+
+
 def _tile(height: int, vectors: int) -> Any:
     """An intrinsic of tiles of so many rows and vectors of columns."""
 
@@ -51,29 +77,13 @@ def _tile(height: int, vectors: int) -> Any:
         def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
             row, inner, column = args[3:]
             zero = ir.Constant(_I64, 0)
-            rows = [ir.Constant(_I64, r) for r in range(height)]
-            columns = [ir.Constant(_I64, 4 * TILE_COLS * v) for v in range(vectors)]
-
-            def after(address, stride, count, kind):  # type: ignore[no-untyped-def]
-                return builder.bitcast(builder.gep(address, [builder.mul(stride, count)]), kind.as_pointer())
-
-            def vector(address, offset):  # type: ignore[no-untyped-def]
-                return builder.bitcast(builder.gep(address, [offset]), _VECTOR.as_pointer())
-
-            left, down, along = element(context, builder, signature.args[0], args[0], row, zero)
+            left = element(context, builder, signature.args[0], args[0], row, zero)
             right, onward, _ = element(context, builder, signature.args[1], args[1], zero, column)
             tile, across, _ = element(context, builder, signature.args[2], args[2], row, column)
-            targets = [[vector(after(tile, across, r, _BYTE), c) for c in columns] for r in rows]
+            lines = [after(builder, tile, across, ir.Constant(_I64, r), _BYTE) for r in range(height)]
+            targets = [vectors_at(builder, line, vectors) for line in lines]
             sums = [[cgutils.alloca_once_value(builder, builder.load(t, align=4)) for t in line] for line in targets]
-            with cgutils.for_range(builder, inner) as loop:
-                begin = after(right, onward, loop.index, _BYTE)
-                factors = [builder.load(vector(begin, c), align=4) for c in columns]
-                values = builder.gep(left, [builder.mul(along, loop.index)])
-                for r, line in zip(rows, sums, strict=True):
-                    value = splat(builder, builder.load(after(values, down, r, ir.FloatType())), _VECTOR)
-                    for factor, total in zip(factors, line, strict=True):
-                        product = builder.fmul(value, factor, flags=("contract",))
-                        builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+            add_products(builder, left, (right, onward), inner, sums)
             for line, totals in zip(targets, sums, strict=True):
                 for target, total in zip(line, totals, strict=True):
                     builder.store(builder.load(total), target, align=4)
@@ -92,10 +102,10 @@ def add_product(a, b, out, rows, inner, columns):  # type: ignore[no-untyped-def
     """out += a @ b, of the first ``rows``, ``inner`` and ``columns``; whole tiles."""
     row = 0
     while row < rows:
-        high = _FOUR_AT_ONCE and row + 8 <= rows
+        high = FOUR_AT_ONCE and row + 8 <= rows
         column = 0
         while column < columns:
-            wide = _FOUR_AT_ONCE and column + 2 * TILE_COLS <= columns
+            wide = FOUR_AT_ONCE and column + 2 * TILE_COLS <= columns
             if high and wide:
                 _high_and_wide(a, b, out, row, inner, column)
             elif high:

@@ -25,7 +25,7 @@ _LEAST_WEIGHT, _TINY = _f(LEAST_WEIGHT), _f(1e-12)
 class ChunkScratch(NamedTuple):
     """Of the rays of a chunk, a slot per thread. Rows: ``CHUNK`` surfaces nearest to the cameras, and ``CHUNK`` behind them."""
 
-    hidden: np.ndarray  # of the taps: a row for each of ``TapStore``
+    gates: np.ndarray  # of the taps: a row for each of ``TapStore``
     features: np.ndarray  # (2, CHUNK, F)
     weight: np.ndarray  # (2, CHUNK)
     distance: np.ndarray
@@ -147,7 +147,7 @@ def see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch,
                 at[n, 0], at[n, 1], at[n, 2] = px, py, pz
                 row_of[n] = row
                 n += 1
-    slopes(at, n, epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
+    slopes(at, n, epsilon, grid, surface, taps, chunk, scratch.gates[slot], found)
     clear(x, whole(n, TILE_ROWS), x.shape[1])
     for i in range(n):
         row = row_of[i]
@@ -211,7 +211,7 @@ def mirrors_backward(  # type: ignore[no-untyped-def]
                 gx, gy_, gz = velocity(px, py, pz, r, gx, gy_, gz)
             at[i, 0], at[i, 1], at[i, 2] = gx, gy_, gz
         loss += pull_to_one(found[i], factor, _ONE, at[i])
-    slopes_backward(at, n, eikonal.mirror_epsilon, grid, surface, taps, chunk, scratch.hidden[slot], first)
+    slopes_backward(at, n, eikonal.mirror_epsilon, grid, surface, taps, chunk, scratch.gates[slot], first)
     add_product(gy.T, h, out.second[chunk], gy.shape[1], n, h.shape[1])
     clear(gh, rows, gh.shape[1])
     add_product(gy, light.second, gh, rows, gy.shape[1], gh.shape[1])

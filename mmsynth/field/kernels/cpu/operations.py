@@ -63,11 +63,12 @@ def _kept(*tensors: Tensor) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
-def _summed(arrays: SurfaceStore | RayStore, chunks: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of a network's hidden layer, which is like this one, and of its last."""
-    units, inputs = like.shape
-    hidden, output = arrays.turned_out[:chunks].sum(0)[:inputs, :units].T, arrays.output_out[:chunks].sum(0)
-    return torch.from_numpy(np.ascontiguousarray(hidden)), torch.from_numpy(np.append(output[:units], output[-1]))
+def _summed(arrays: SurfaceStore | RayStore, chunks: int, hidden: Tensor, output: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of a network's hidden layer and of its last, see ``units``."""
+    units, inputs = hidden.shape
+    pulled = arrays.pulled_out[:chunks].sum(0)[:inputs, :units].T
+    to_hidden, to_output = as_array(output)[:units, None] * pulled, (as_array(hidden) * pulled).sum(1)
+    return torch.from_numpy(to_hidden), torch.from_numpy(np.append(to_output, arrays.bias_out[:chunks].sum(dtype=np.float32)))
 
 
 def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:
@@ -105,7 +106,7 @@ class _Value(torch.autograd.Function):
         if grid.table.requires_grad:
             take_all(grid.active, surface.surface_scatter, count, table, arrays, gradient_of(grid.table).numpy())
         ctx.store = None
-        return None, positions, None, None, *_summed(arrays, chunks, hidden)
+        return None, positions, None, None, *_summed(arrays, chunks, hidden, output)
 
 
 def classify(states: Tensor, cells: Cells, grid: GridTable, network: SurfaceNetwork) -> None:
@@ -183,7 +184,7 @@ class _Trace(torch.autograd.Function):
             gradients = gradient_of(grid.table).numpy(), gradient_of(appearance.table).numpy()
             take_all(grid.active + appearance.active, tracing_gradients.trace_scatter, count, table, look, arrays, *gradients)
         ctx.store = None
-        return None, *to_rays, *_summed(arrays, chunks, hidden), None
+        return None, *to_rays, *_summed(arrays, chunks, hidden, output), None
 
 
 def compare(

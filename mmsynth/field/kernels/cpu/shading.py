@@ -9,7 +9,6 @@ Matrices have whole tiles, see ``matrices``: they are padded with zeros.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from numba import types
 
 from mmsynth.field.kernels.constants import HUBER_DELTA
 from mmsynth.field.kernels.cpu.jit import allocating_kernel, allocating_part, inlined, kernel, part
+from mmsynth.field.kernels.cpu.logistic import softplus_of
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, padded, whole
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take
@@ -85,21 +85,13 @@ def layer_backward(n, x, inputs, g, out, weight_out, bias_out):  # type: ignore[
     add_product(g.T, x, weight_out, units, n, inputs)
 
 
-@inlined()
-def _softplus(x):  # type: ignore[no-untyped-def]
-    """log (1 + exp x), and its slope."""
-    one = np.float32(1.0)
-    small = np.float32(math.exp(-abs(x)))
-    return max(x, np.float32(0.0)) + np.float32(math.log1p(small)), (one if x > np.float32(0.0) else small) / (one + small)
-
-
 @part()
 def _intensity(raw, e, slope):  # type: ignore[no-untyped-def]
     """|Lᵀ e|² (see ``shading.intensity`` of the definition) and its slope, both of six numbers."""
     two = np.float32(2.0)
-    a, slope_a = _softplus(raw[0])
-    b, slope_b = _softplus(raw[1])
-    c, slope_c = _softplus(raw[2])
+    a, slope_a = softplus_of(raw[0])
+    b, slope_b = softplus_of(raw[1])
+    c, slope_c = softplus_of(raw[2])
     v0 = a * e[0] + raw[3] * e[1] + raw[4] * e[2]
     v1 = b * e[1] + raw[5] * e[2]
     v2 = c * e[2]
@@ -138,7 +130,7 @@ def _measurements(  # type: ignore[no-untyped-def]
                     total += w[k] * h[k]
                 raw[j] = total + heads_bias[column + j]
             if m < bright:
-                lights[a], slope[6 * a] = _softplus(raw[0])
+                lights[a], slope[6 * a] = softplus_of(raw[0])
             else:
                 lights[a] = _intensity(raw, axes[m - bright], slope[6 * a :])
             seen += lights[a] * share[places[a]]

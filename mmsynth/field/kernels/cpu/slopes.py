@@ -24,17 +24,17 @@ _of_taps = on_stack(types.float32, 4 * TAPPED)
 
 
 class TapStore(NamedTuple):
-    """Of points at which the surface's gradient is asked for, a slot per chunk: block (see ``blocks``), four rows a point; used: rows; the
-    weights' gradients."""
+    """Of points at which the surface's gradient is asked for, a slot per chunk: block (see ``blocks``), four rows a point; used: rows;
+    pulled_out, bias_out: see ``surface_block_backward``."""
 
     block: np.ndarray
     used: np.ndarray
-    turned_out: np.ndarray
-    output_out: np.ndarray
+    pulled_out: np.ndarray
+    bias_out: np.ndarray
 
 
 @part()
-def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: ignore[no-untyped-def]
+def slopes(at, n, epsilon, grid, surface, taps, slot, gates, found):  # type: ignore[no-untyped-def]
     """See ``learning.surface_gradient``: of n points ``at`` (n, 3), whose taps are kept in the slot of ``taps`` behind what is there."""
     move, scale = epsilon / _f(math.sqrt(3.0)), _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
     values = _of_taps()
@@ -47,7 +47,7 @@ def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: i
                 for a in range(3):
                     block[row, a] = at[begin + i, a] + move * _TAPS[t, a]
                 block[row, 3] = _ONE
-        surface_block(block, hidden[used:], values, 4 * count, grid, surface)
+        surface_block(block, gates[used:], values, 4 * count, grid, surface)
         for i in range(count):
             for a in range(3):
                 total = _ZERO
@@ -58,7 +58,7 @@ def slopes(at, n, epsilon, grid, surface, taps, slot, hidden, found):  # type: i
 
 
 @part()
-def slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  # type: ignore[no-untyped-def]
+def slopes_backward(g, n, epsilon, grid, surface, taps, slot, gates, first):  # type: ignore[no-untyped-def]
     """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
     scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
     values = _of_taps()
@@ -71,8 +71,7 @@ def slopes_backward(g, n, epsilon, grid, surface, taps, slot, hidden, first):  #
                     total += g[begin + i, a] * _TAPS[t, a]
                 values[4 * i + t] = total * scale
         surface_block_backward(
-            taps.block[slot, used:], hidden[used:], values, 4 * count, grid.active, surface, taps.turned_out[slot],
-            taps.output_out[slot],
+            taps.block[slot, used:], gates[used:], values, 4 * count, grid.active, surface, taps.pulled_out[slot], taps.bias_out[slot],
         )  # fmt: skip
 
 
@@ -98,13 +97,13 @@ def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, sc
     """The pull at some of the points of all space: its part of the loss."""
     at, found, g = points[begin : begin + count], scratch.found[slot], scratch.at[slot]
     taps.used[chunk, 0] = 0
-    taps.turned_out[chunk], taps.output_out[chunk] = _ZERO, _ZERO
-    slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
+    taps.pulled_out[chunk], taps.bias_out[chunk] = _ZERO, _ZERO
+    slopes(at, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.gates[slot], found)
     loss = 0.0
     for i in range(count):
         g[i, 0], g[i, 1], g[i, 2] = _ZERO, _ZERO, _ZERO
         loss += pull_to_one(found[i], factor, eikonal.shallow if is_within(at[i]) else _ONE, g[i])
-    slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
+    slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.gates[slot], 0)
     return loss
 
 
@@ -128,10 +127,10 @@ def learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface, 
         at[n, 0], at[n, 1], at[n, 2] = px + eikonal.noise[q, 0], py + eikonal.noise[q, 1], pz + eikonal.noise[q, 2]
         shallow[n] = eikonal.shallow if is_within(at[n]) else _ONE
         n += 1
-    slopes(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], found)
+    slopes(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.gates[slot], found)
     loss = 0.0
     for i in range(n):
         at[i, 0], at[i, 1], at[i, 2] = _ZERO, _ZERO, _ZERO
         loss += pull_to_one(found[i], factor, shallow[i], at[i])
-    slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.hidden[slot], 0)
+    slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.gates[slot], 0)
     return loss

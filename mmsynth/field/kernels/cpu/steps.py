@@ -81,8 +81,8 @@ def learn(
             step.appearance.table.data_ptr(): (look.offsets[: look.active + 1], 1 + table.active),
         }
         return (
-            np.zeros(1, np.int64), done, count, points, table, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns, used,
-            lamps.spectrum, gradient_of(step.grid.table).numpy(), gradient_of(step.appearance.table).numpy(), gradients, sums,
+            np.zeros(1, np.int64), done, count, points, table, network, look, kept.arrays, taps.arrays, weights.arrays, out.arrays, columns,
+            used, lamps.spectrum, gradient_of(step.grid.table).numpy(), gradient_of(step.appearance.table).numpy(), gradients, sums,
             *places_and_numbers(update() if update is not None else (), of_levels),
         )  # fmt: skip
 

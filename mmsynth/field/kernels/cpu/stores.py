@@ -18,6 +18,7 @@ from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, whole
 from mmsynth.field.kernels.cpu.mirrors import ChunkScratch, LightOut
 from mmsynth.field.kernels.cpu.slopes import MOST_TAPPED, TapStore
 from mmsynth.field.kernels.cpu.surface import POINTS
+from mmsynth.field.kernels.cpu.units import GATES
 from mmsynth.field.kernels.parameters import ShaderWeights
 
 S = TypeVar("S", bound=tuple[Any, ...])
@@ -30,23 +31,23 @@ _changing = threading.RLock()  # of the pool. A thread that holds it may find ga
 
 
 class SurfaceStore(NamedTuple):
-    """Of positions: block, hidden (see ``blocks``), and the weights' gradients."""
+    """Of positions: block, gates, and what the weights' gradients follow from (see ``blocks``)."""
 
     block: np.ndarray
-    hidden: np.ndarray
-    turned_out: np.ndarray
-    output_out: np.ndarray
+    gates: np.ndarray
+    pulled_out: np.ndarray
+    bias_out: np.ndarray
 
 
 class RayStore(NamedTuple):
-    """Of rays. Per sample, in the order of the blocks: block, hidden, sdf, ray_of, time_of. Per ray and number of the sample
+    """Of rays. Per sample, in the order of the blocks: block, gates, sdf, ray_of, time_of. Per ray and number of the sample
     (i * MAX_SAMPLES_PER_RAY + k): t_of, f_of (distance), p_of (softplus of -s f), q_of (minus its slope over s), opacity_of (of the
     section that begins there), id_of (place in the order of the blocks); counts: samples of each ray; second: the sample at which its
     second surface begins; samples: of all. Sections that matter: s_block (a block, too), s_ray, s_k (its first sample), s_time, s_weight,
-    s_count. The weights' gradients."""
+    s_count. What the weights' gradients follow from."""
 
     block: np.ndarray
-    hidden: np.ndarray
+    gates: np.ndarray
     sdf: np.ndarray
     ray_of: np.ndarray
     time_of: np.ndarray
@@ -65,8 +66,8 @@ class RayStore(NamedTuple):
     s_time: np.ndarray
     s_weight: np.ndarray
     s_count: np.ndarray
-    turned_out: np.ndarray
-    output_out: np.ndarray
+    pulled_out: np.ndarray
+    bias_out: np.ndarray
 
 
 class ShadingStore(NamedTuple):
@@ -121,9 +122,10 @@ def _tiles(count: int) -> int:
 
 
 def _network(rows: int, units: int, levels: int) -> Sizes:
-    """Rows of blocks of so many levels, hidden units, and the weights' gradients."""
+    """Rows of blocks of so many levels, gates of hidden units, and what the weights' gradients follow from."""
     f, width, units = np.float32, FIRST_FEATURE_ROW + _tiles(FEATURES * levels), _tiles(units)
-    return {"block": (f, (rows, width)), "hidden": (f, (rows, units)), "turned_out": (f, (width, units)), "output_out": (f, (units + 1,))}
+    gates = np.uint16, (rows, units // GATES)
+    return {"block": (f, (rows, width)), "gates": gates, "pulled_out": (f, (width, units)), "bias_out": (f, (1,))}
 
 
 def surface_store(slots: int, units: int, levels: int) -> Store[SurfaceStore]:
@@ -181,7 +183,7 @@ def tap_store(slots: int, units: int, levels: int) -> Store[TapStore]:
 @functools.cache
 def _tap_sizes(units: int, levels: int) -> Key:
     sizes = _network(_TAPS, units, levels)
-    del sizes["hidden"]
+    del sizes["gates"]
     return tuple({"used": (np.int64, (1,)), **sizes}.items())
 
 
@@ -193,7 +195,7 @@ def table_store(slots: int, units: int, levels: int, appearance_levels: int) -> 
 @functools.cache
 def _table_sizes(units: int, levels: int, appearance_levels: int) -> Key:
     sizes = _network(CAPACITY, units, levels)
-    del sizes["hidden"]
+    del sizes["gates"]
     sizes["s_block"] = np.float32, (CAPACITY, FIRST_FEATURE_ROW + FEATURES * appearance_levels)
     return tuple({"samples": (np.int64, (1,)), "sections": (np.int64, (1,)), **sizes}.items())
 
@@ -209,7 +211,7 @@ def _scratch_sizes(units: int, features: int, materials: int, hidden: int) -> Ke
     rows, columns = 2 * CHUNK, (2, CHUNK)
     three, some = (f, (rows, 3)), 2 * shading.CHUNK
     sizes: Sizes = {
-        "hidden": (f, (_TAPS, _tiles(units))),
+        "gates": (np.uint16, (_TAPS, _tiles(units) // GATES)),
         "features": (f, (*columns, features)), "weight": (f, columns), "distance": (f, columns), "shown": (f, columns), "depth": (f,
         (CHUNK,)),
         "behind": (np.int64, (CHUNK,)), "mixed": (f, (rows, features)), "mixed_share": (f, (rows,)), "g_features": (f, (rows, features)),

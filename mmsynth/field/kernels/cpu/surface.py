@@ -38,23 +38,21 @@ def surface_forward(next_task, positions, grid, layers, keep, store, out):  # ty
             for a in range(3):
                 b[i, a] = positions[begin + i, a]
             b[i, 3] = np.float32(1.0)
-        surface_block(b, store.hidden[slot], out[begin : begin + n], n, grid, layers)
+        surface_block(b, store.gates[slot], out[begin : begin + n], n, grid, layers)
         chunk = take(next_task, 0)
 
 
 @kernel
 def surface_backward(next_task, gradient, active, layers, store):  # type: ignore[no-untyped-def]
-    """Gradients of the weights per block; hidden units and features become gradients."""
+    """What the gradients of the weights follow from, per block; features become gradients."""
     count = gradient.shape[0]
     chunk = take(next_task, 0)
     while chunk * POINTS < count:
         begin = chunk * POINTS
         n = min(POINTS, count - begin)
-        turned_out, output_out = store.turned_out[chunk], store.output_out[chunk]
-        turned_out[:], output_out[:] = _ZERO, _ZERO
-        surface_block_backward(
-            store.block[chunk], store.hidden[chunk], gradient[begin : begin + n], n, active, layers, turned_out, output_out
-        )
+        pulled_out, bias_out = store.pulled_out[chunk], store.bias_out[chunk]
+        pulled_out[:], bias_out[:] = _ZERO, _ZERO
+        surface_block_backward(store.block[chunk], store.gates[chunk], gradient[begin : begin + n], n, active, layers, pulled_out, bias_out)
         chunk = take(next_task, 0)
 
 
@@ -67,24 +65,24 @@ def surface_positions(next_task, gradient, grid, layers, store, positions_out): 
         begin = chunk * POINTS
         n = min(POINTS, count - begin)
         out = positions_out[begin : begin + n]
-        surface_block_positions(store.block[chunk], store.hidden[chunk], gradient[begin : begin + n], n, grid, layers, out)
+        surface_block_positions(store.block[chunk], store.gates[chunk], gradient[begin : begin + n], n, grid, layers, out)
         chunk = take(next_task, 0)
 
 
 @kernel
 def surface_scatter(next_task, count, grid, store, gradient):  # type: ignore[no-untyped-def]
     """The table's gradient, one task per level."""
-    level = take(next_task, 0)
-    while level < grid.active:
+    level = grid.active - 1 - take(next_task, 0)  # fine ones first: they take longest
+    while level >= 0:
         for chunk in range((count + POINTS - 1) // POINTS):
             scatter_block(store.block[chunk], np.int64(min(POINTS, count - chunk * POINTS)), grid, gradient, level)
-        level = take(next_task, 0)
+        level = grid.active - 1 - take(next_task, 0)
 
 
 @part()
-def _classify_block(n, where, states, cells, grid, layers, block, hidden, value):  # type: ignore[no-untyped-def]
+def _classify_block(n, where, states, cells, grid, layers, block, gates, value):  # type: ignore[no-untyped-def]
     """States of n cells, whose centres the block holds."""
-    surface_block(block, hidden, value, n, grid, layers)
+    surface_block(block, gates, value, n, grid, layers)
     for i in range(n):
         if value[i] > cells.margin:
             states[where[i]] = np.uint8(_f(OUTSIDE) + min(max((value[i] - cells.margin) * cells.halves, _ZERO), _MOST))
@@ -96,7 +94,7 @@ def _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
 def classify(next_task, states, centre, cells, grid, layers, store):  # type: ignore[no-untyped-def]
     """See ``reference.classify``. states: (G³,). centre: (G,), of cells along an axis. store: a slot for each thread."""
     slot, side, n = take(next_task, 1), len(centre), 0
-    block, hidden = store.block[slot], store.hidden[slot]
+    block, gates = store.block[slot], store.gates[slot]
     where, value = _places(), _values()
     while True:
         begin = take(next_task, 0) * CELLS
@@ -113,6 +111,6 @@ def classify(next_task, states, centre, cells, grid, layers, store):  # type: ig
             where[n] = cell
             n += 1
             if n == POINTS:
-                _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
+                _classify_block(n, where, states, cells, grid, layers, block, gates, value)
                 n = 0
-    _classify_block(n, where, states, cells, grid, layers, block, hidden, value)
+    _classify_block(n, where, states, cells, grid, layers, block, gates, value)

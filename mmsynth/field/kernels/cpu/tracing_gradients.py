@@ -74,18 +74,19 @@ def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, s
 
 
 @part()
-def samples_backward(block, hidden, g, samples, active, layers, turned_out, output_out):  # type: ignore[no-untyped-def]
+def samples_backward(block, gates, g, samples, active, layers, pulled_out, bias_out):  # type: ignore[no-untyped-def]
     """``surface_block_backward`` of many samples, a part at a time."""
     for used in range(0, samples, CHUNK):
         n = np.int64(min(CHUNK, samples - used))
-        surface_block_backward(block[used:], hidden[used:], g[used:], n, active, layers, turned_out, output_out)
+        surface_block_backward(block[used:], gates[used:], g[used:], n, active, layers, pulled_out, bias_out)
 
 
 @kernel
 def trace_backward(  # type: ignore[no-untyped-def]
     next_task, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
 ):
-    """Gradients of what ``trace_forward`` stored: weights per chunk; distances and feature rows are replaced by their gradients.
+    """Gradients of what ``trace_forward`` stored: what those of the weights follow from, per chunk; distances and feature rows are replaced
+    by theirs.
 
     behind: (R,) rows of ``features`` and of the others, which are as in ``Hits``.
     """
@@ -93,18 +94,18 @@ def trace_backward(  # type: ignore[no-untyped-def]
     chunk = take(next_task, 0)
     while chunk * CHUNK < rays:
         begin = chunk * CHUNK
-        count, turned_out, output_out = min(CHUNK, rays - begin), store.turned_out[chunk], store.output_out[chunk]
+        count, pulled_out, bias_out = min(CHUNK, rays - begin), store.pulled_out[chunk], store.bias_out[chunk]
         rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store)
-        turned_out[:], output_out[:] = np.float32(0.0), np.float32(0.0)
+        pulled_out[:], bias_out[:] = np.float32(0.0), np.float32(0.0)
         samples_backward(
             store.block[chunk],
-            store.hidden[chunk],
+            store.gates[chunk],
             store.sdf[chunk],
             np.int64(store.samples[chunk, 0]),
             active,
             layers,
-            turned_out,
-            output_out,
+            pulled_out,
+            bias_out,
         )
         chunk = take(next_task, 0)
 
@@ -112,15 +113,15 @@ def trace_backward(  # type: ignore[no-untyped-def]
 @kernel
 def trace_scatter(next_task, rays, grid, appearance, store, gradient, a_gradient):  # type: ignore[no-untyped-def]
     """Both tables' gradients, one task per level and table."""
-    chunks = (rays + CHUNK - 1) // CHUNK
-    task = take(next_task, 0)
-    while task < grid.active + appearance.active:
+    chunks, tasks = (rays + CHUNK - 1) // CHUNK, grid.active + appearance.active
+    task = tasks - 1 - take(next_task, 0)  # fine levels first, see ``surface_scatter``
+    while task >= 0:
         for chunk in range(chunks):
             if task < grid.active:
                 scatter_block(store.block[chunk], np.int64(store.samples[chunk, 0]), grid, gradient, task)
             else:
                 scatter_block(store.s_block[chunk], np.int64(store.s_count[chunk, 0]), appearance, a_gradient, task - grid.active)
-        task = take(next_task, 0)
+        task = tasks - 1 - take(next_task, 0)
 
 
 @inlined()
@@ -156,7 +157,7 @@ def trace_rays_backward(  # type: ignore[no-untyped-def]
                 out[:n] = np.float32(0.0)
                 position_block(store.s_block[chunk], n, appearance, out)
             else:
-                surface_block_positions(store.block[chunk], store.hidden[chunk], store.sdf[chunk], n, grid, layers, out)
+                surface_block_positions(store.block[chunk], store.gates[chunk], store.sdf[chunk], n, grid, layers, out)
             for i in range(n):
                 o = begin + (store.s_ray[chunk, i] if last else store.ray_of[chunk, i])
                 t = store.s_time[chunk, i] if last else store.time_of[chunk, i]
