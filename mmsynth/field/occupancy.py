@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mmsynth.field import kernels
 from mmsynth.field.kernels import OUTSIDE, SHELL, Cells, GridTable, SurfaceNetwork, reference
 
-_TURNS = 16  # at the least
+_TURNS, _CELLS = 16, 50_000  # at the most, or a few more, and cells that are worth no more
 _NEXT = 5  # cells on: those on both sides of one have their turn long before it comes again
 
 
@@ -67,7 +67,8 @@ class Occupancy(nn.Module):
         """Updates until each cell was looked at."""
         # without a factor in common with the grid's side: or else the cells of a plane, which a table may lie in, would all wait for one
         # turn, and a surface could not move there until then
-        return next(n for n in itertools.count(_TURNS) if math.gcd(n, self.states.shape[0] * _NEXT) == 1)
+        fewest = min(_TURNS, -(-self.states.numel() // _CELLS))
+        return next(n for n in itertools.count(fewest) if math.gcd(n, self.states.shape[0] * _NEXT) == 1)
 
     def empty(self, cells: Tensor) -> None:
         """Let rays pass cells, (G, G, G) bool, whatever the distance in them; the next update asks it again."""

@@ -570,13 +570,13 @@ def test_an_empty_occupancy_grid_reopens(row: Row) -> None:
 
 def test_a_pruned_cell_comes_back() -> None:
     """A surface that moves into cells that were certified is there when each has had its turn, and no later."""
-    moved, anew = Occupancy(8), Occupancy(8)
+    moved, anew = Occupancy(48), Occupancy(48)
     moved.update(lambda x: x[:, 0] + 0.9, 500.0)
-    assert (moved.states[7] >= OUTSIDE).all()
+    assert (moved.states[45] >= OUTSIDE).all() and moved.turns > 1
     for turn in range(40, 40 + moved.turns):
         moved.update(lambda x: x[:, 0] - 0.9, 500.0, turn)
     anew.update(lambda x: x[:, 0] - 0.9, 500.0)
-    assert torch.equal(moved.states, anew.states) and (moved.states[7] == SHELL).any()
+    assert torch.equal(moved.states, anew.states) and (moved.states[45] == SHELL).any()
 
 
 @pytest.mark.parametrize("grid", [8, 16, 48, 64, 85, 96, 102, 255, 256])
@@ -600,7 +600,8 @@ def test_the_cells_of_a_plane_do_not_wait_for_one_turn(grid: int, row: Row) -> N
         planes += [torch.bincount(index[:, axis], minlength=grid) for axis in range(3)]
     assert (looked_at == 1).all()
     counts = torch.stack(planes).double() / (grid**2 / turns)  # of each plane in each turn, one if even
-    assert 16 <= turns <= 21 and counts.min() > (0.9 if grid >= turns else 0) and counts.max() < 1 + 2 * turns / grid
+    assert turns <= 21 and (turns >= 16 or grid**3 <= 50_000 * turns)  # cells of a turn
+    assert counts.min() > (0.9 if grid >= turns else 0) and counts.max() < 1 + 2 * turns / grid
     if grid == 96:
         row(
             "the cells of a plane of the occupancy grid, looked at anew",

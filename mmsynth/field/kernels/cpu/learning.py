@@ -220,13 +220,11 @@ def learn_rays(  # type: ignore[no-untyped-def]
 @part()
 def _add_weights(chunks, tasks, network, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
     """Add to the gradients of weights, biases and lamps what each chunk found: the sum of all that they are then, finite if each is."""
-    g, units = gradients, gradients.hidden.shape[0]
-    pulled = kept.pulled_out[0]
-    add_sum(kept.pulled_out[1:chunks], pulled)
-    add_sum(taps.pulled_out[:tasks], pulled)
-    add_of_units(pulled, network.hidden, network.output, g.hidden, g.output)
-    for parts in (kept.bias_out[:chunks], taps.bias_out[:tasks]):
-        add_sums(parts, g.output[units:])
+    g, pulled, bias = gradients, kept.pulled_out[0], kept.bias_out[0]
+    for parts, biases in ((kept.pulled_out[1:chunks], kept.bias_out[1:chunks]), (taps.pulled_out[:tasks], taps.bias_out[:tasks])):
+        add_sum(parts, pulled)
+        add_sums(biases, bias)
+    add_of_units(pulled, bias[0], network.hidden, network.output, g.hidden, g.output)
     add_sum(shaded.first_out[:chunks], g.first)
     add_sums(shaded.first_bias_out[:chunks], g.first_bias)
     add_sum(shaded.second_out[:chunks], g.second)

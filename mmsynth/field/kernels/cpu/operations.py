@@ -66,9 +66,10 @@ def _kept(*tensors: Tensor) -> bool:
 def _summed(arrays: SurfaceStore | RayStore, chunks: int, hidden: Tensor, output: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of a network's hidden layer and of its last, see ``units``."""
     units, inputs = hidden.shape
-    pulled = arrays.pulled_out[:chunks].sum(0)[:inputs, :units].T
-    to_hidden, to_output = as_array(output)[:units, None] * pulled, (as_array(hidden) * pulled).sum(1)
-    return torch.from_numpy(to_hidden), torch.from_numpy(np.append(to_output, arrays.bias_out[:chunks].sum(dtype=np.float32)))
+    pulled, bias = arrays.pulled_out[:chunks].sum(0)[:inputs, :units].T, arrays.bias_out[:chunks].sum(dtype=np.float32)
+    # what is not finite is seen, by units that are not above zero, too
+    to_output = (as_array(hidden) * pulled).sum(1) + np.float32(0.0) * bias
+    return torch.from_numpy(as_array(output)[:units, None] * pulled), torch.from_numpy(np.append(to_output, bias))
 
 
 def surface_value(positions: Tensor, grid: GridTable, network: SurfaceNetwork) -> Tensor:

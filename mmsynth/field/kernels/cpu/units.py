@@ -136,15 +136,16 @@ def let_through(typingctx, gates, i, pull, out, row):  # type: ignore[no-untyped
 
 
 @part()
-def add_of_units(pulled, hidden, output, g_hidden, g_output):  # type: ignore[no-untyped-def]
-    """Add to the gradients of the network's weights what follows from G, (inputs, units).
+def add_of_units(pulled, bias, hidden, output, g_hidden, g_output):  # type: ignore[no-untyped-def]
+    """Add to the gradients of the network's weights what follows from G, (inputs, units), and from the sum of all g, the bias' gradient.
 
     hidden: (H, inputs), output: (H + 1,); g_hidden, g_output: their gradients, to which is added.
     """
     units, inputs = hidden.shape
     for k in range(units):
-        total = np.float32(0.0)
+        total = np.float32(0.0) * bias  # what is not finite is seen, by units that are not above zero, too
         for j in range(inputs):
             g_hidden[k, j] += output[k] * pulled[j, k]
             total += hidden[k, j] * pulled[j, k]
         g_output[k] += total
+    g_output[units] += bias
