@@ -15,7 +15,7 @@ from numba import types
 
 from mmsynth.field.kernels.constants import FEATURES, FIRST_FEATURE_ROW, MOSTLY_BLOCKED
 from mmsynth.field.kernels.cpu import shading
-from mmsynth.field.kernels.cpu.blocks import scatter_block
+from mmsynth.field.kernels.cpu.blocks import scatter_block, surface_block_backward
 from mmsynth.field.kernels.cpu.drawing import draw_chunk, drawing_tasks
 from mmsynth.field.kernels.cpu.jit import kernel, part
 from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
@@ -26,7 +26,7 @@ from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, fir
 from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take, tell, wait
-from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward, samples_backward
+from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward
 from mmsynth.field.kernels.cpu.units import add_of_units
 from mmsynth.field.kernels.parameters import Rays, ShadedRays
 
@@ -145,7 +145,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
     kept.pulled_out[chunk], kept.bias_out[chunk] = _ZERO, _ZERO
     n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
-    samples_backward(
+    surface_block_backward(
         kept.block[chunk], store.gates[slot], store.sdf[slot], n, grid.active, surface, kept.pulled_out[chunk], kept.bias_out[chunk]
     )
     return loss
@@ -220,7 +220,7 @@ def learn_rays(  # type: ignore[no-untyped-def]
 @part()
 def _add_weights(chunks, tasks, network, kept, taps, shaded, out, rows, used, spectrum, gradients):  # type: ignore[no-untyped-def]
     """Add to the gradients of weights, biases and lamps what each chunk found: the sum of all that they are then, finite if each is."""
-    g, pulled, bias = gradients, kept.pulled_out[0], kept.bias_out[0]
+    g, pulled, bias = gradients, kept.pulled_out[0], kept.bias_out[0]  # the first chunk's become the sums
     for parts, biases in ((kept.pulled_out[1:chunks], kept.bias_out[1:chunks]), (taps.pulled_out[:tasks], taps.bias_out[:tasks])):
         add_sum(parts, pulled)
         add_sums(biases, bias)

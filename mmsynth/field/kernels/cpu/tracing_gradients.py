@@ -73,14 +73,6 @@ def rays_backward(begin, count, chunk, behind, g_features, g_weight, features, s
                 sdf[chunk, id_of[chunk, end]] -= np.float32(d_tau * q_of[chunk, end])
 
 
-@part()
-def samples_backward(block, gates, g, samples, active, layers, pulled_out, bias_out):  # type: ignore[no-untyped-def]
-    """``surface_block_backward`` of many samples, a part at a time."""
-    for used in range(0, samples, CHUNK):
-        n = np.int64(min(CHUNK, samples - used))
-        surface_block_backward(block[used:], gates[used:], g[used:], n, active, layers, pulled_out, bias_out)
-
-
 @kernel
 def trace_backward(  # type: ignore[no-untyped-def]
     next_task, behind, g_features, g_weight, features, shown, sharpness, active, layers, a_active, store
@@ -97,7 +89,7 @@ def trace_backward(  # type: ignore[no-untyped-def]
         count, pulled_out, bias_out = min(CHUNK, rays - begin), store.pulled_out[chunk], store.bias_out[chunk]
         rays_backward(begin, count, chunk, behind, g_features, g_weight, features, shown, sharpness, a_active, store)
         pulled_out[:], bias_out[:] = np.float32(0.0), np.float32(0.0)
-        samples_backward(
+        surface_block_backward(
             store.block[chunk],
             store.gates[chunk],
             store.sdf[chunk],
