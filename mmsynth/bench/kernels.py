@@ -111,7 +111,7 @@ def _field() -> Inputs:
         nn.init.normal_(surface.output_weight, std=0.1)
         nn.init.normal_(appearance.table)
         occupancy = Occupancy(64)
-        occupancy.update(lambda x: reference.surface_value(x, *surface.at(_LEVELS[0])), _SAMPLING.sharpness, _generator(), 1.0)
+        occupancy.update(lambda x: reference.surface_value(x, *surface.at(_LEVELS[0])), _SAMPLING.sharpness)
     return {"surface": surface, "appearance": appearance, "occupancy": occupancy}
 
 

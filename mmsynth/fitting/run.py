@@ -225,7 +225,7 @@ def _finished(trainer: Trainer) -> Field:
     trainer.average.apply()
     field.sampling = _rendered_sampling(trainer)
     surface, sharpness = field.surface.at(field.sampling.active_surface), field.sampling.sharpness
-    field.occupancy.update(surface, sharpness, torch.Generator().manual_seed(0), 1.0)
+    field.occupancy.update(surface, sharpness)
     if field.design.background:
         unseen = unseen_before_cameras(trainer.measurements.values(), len(field.occupancy.states), solid_of(field))
         field.occupancy.empty(torch.from_numpy(unseen))

@@ -225,8 +225,8 @@ class Trainer:
         """What is due before a step: the occupancy grid, where rays go, the rows of the tables, what residuals decide, the poses."""
         state, schedule, field = self.state, self.recipe.schedule, self.field
         if state.step % self.recipe.sampling.occupancy_every == 0:
-            share = 1.0 if state.step == 0 else 1 / 16
-            if not field.occupancy.update(field.surface.at(sampling.active_surface), sampling.sharpness, generator, share):
+            turn = state.step // self.recipe.sampling.occupancy_every or None  # all cells at the start
+            if not field.occupancy.update(field.surface.at(sampling.active_surface), sampling.sharpness, turn):
                 state.reopened += 1
         held = self._held_at(self.progress)
         if state.step % _RENEW_EVERY == 0:

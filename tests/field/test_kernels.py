@@ -215,7 +215,7 @@ def _parts(extent: float, states: str, seed: int, levels: int = 3) -> tuple[Surf
         surface.output_weight.normal_(0, 0.05)
         appearance.table.normal_()
     if states == "own":
-        occupancy.update(lambda x: surface(x, 3), 40.0, torch.Generator().manual_seed(seed), 1.0)
+        occupancy.update(lambda x: surface(x, 3), 40.0)
         assert set(range(OUTSIDE + 3)) <= set(occupancy.states.unique().tolist())
     elif states == "random":
         number = torch.randint(0, 40, occupancy.states.shape)
@@ -421,20 +421,20 @@ def test_is_compiled_says_so() -> None:
 
 
 @pytest.mark.parametrize("extent", [1.0, 2.0])
-@pytest.mark.parametrize("share", [1.0, 1 / 16, 1 / 3])
+@pytest.mark.parametrize("turns", [False, True])
 @pytest.mark.parametrize("grid", [3, 5, 32, 40])  # the last two: more than one task
-def test_cells_are_those_of_the_definition(extent: float, share: float, grid: int, use_threads: Callable[[int], None]) -> None:
+def test_cells_are_those_of_the_definition(extent: float, turns: bool, grid: int, use_threads: Callable[[int], None]) -> None:
     """To the bit, while the surface moves, and by any number of threads."""
     surface, *_ = _parts(extent, "shell", 4)
     ours, theirs, alone = (Occupancy(grid, extent) for _ in range(3))
     for step, sharpness in enumerate((20.0, 60.0, 400.0, 90.0)):
         with torch.no_grad():
             surface.grid.table.mul_(0.8)
-        at = [torch.Generator().manual_seed(step) for _ in range(3)]
-        open_ = theirs.update(lambda x: surface(x, 3), sharpness, at[0], share)
-        for threads, cells, random in ((3, ours, at[1]), (1, alone, at[2])):
+        turn = step if turns else None
+        open_ = theirs.update(lambda x: surface(x, 3), sharpness, turn)
+        for threads, cells in ((3, ours), (1, alone)):
             use_threads(threads)
-            assert cells.update(surface.at(3), sharpness, random, share) == open_
+            assert cells.update(surface.at(3), sharpness, turn) == open_
         assert torch.equal(ours.states, theirs.states) and torch.equal(alone.states, theirs.states)
     assert grid < 32 or len(ours.states.unique()) > 5
 
@@ -444,7 +444,7 @@ def test_a_cell_whose_distance_is_not_a_number_stays_open() -> None:
     with torch.no_grad():
         surface.output_weight[-1] = torch.nan
     occupancy = Occupancy(8)
-    assert occupancy.update(surface.at(3), 50.0, torch.Generator().manual_seed(0), 1.0)
+    assert occupancy.update(surface.at(3), 50.0)
     assert (occupancy.states == SHELL).all()
 
 

@@ -50,7 +50,7 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
         nn.init.normal_(light.second.weight, std=0.3)
         light.used[1 if lamps > 2 else 0] = lamps <= 2  # used lamps need not be the first
     occupancy = Occupancy(24, extent)
-    occupancy.update(lambda x: surface(x, 3), 30.0, torch.Generator().manual_seed(0), 1.0)
+    occupancy.update(lambda x: surface(x, 3), 30.0)
     count = RAYS + extra
     origins = nn.functional.normalize(torch.randn(count, 3), dim=1) * 1.6
     directions = nn.functional.normalize(0.35 * torch.randn(count, 3) - origins, dim=1)

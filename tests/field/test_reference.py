@@ -235,7 +235,7 @@ def _march(sdf: Distance, extent: float, classified: bool, jitter: float) -> tup
     near, far = ball_interval(origins, directions) if extent == 1 else (torch.zeros(120).double(), torch.full((120,), 1e3).double())
     occupancy = Occupancy(32, extent)
     if classified:
-        occupancy.update(sdf, SHARPNESS, torch.Generator().manual_seed(0), 1.0)
+        occupancy.update(sdf, SHARPNESS)
         assert (occupancy.states == SHELL).any() and (occupancy.states >= OUTSIDE).float().mean() > 0.3
     t, ray, offsets = reference.march(
         sdf, Rays(origins, directions, near, far, torch.full((120,), jitter).double()), occupancy.states, extent, SAMPLING
@@ -351,7 +351,7 @@ def test_states_are_true_of_every_point_of_a_cell(extent: float, sharpness: floa
     sdf = sphere if extent == 1 else room
     grid = 24
     occupancy = Occupancy(grid, extent)
-    assert occupancy.update(sdf, sharpness, torch.Generator().manual_seed(0), 1.0)
+    assert occupancy.update(sdf, sharpness)
     corners = torch.rand(grid, grid, grid, 40, 3, generator=torch.Generator().manual_seed(1))
     index = torch.stack(torch.meshgrid(*[torch.arange(grid)] * 3, indexing="ij"), -1)
     x = ((index[..., None, :] + corners) * (2 / grid) - 1) * extent

@@ -46,9 +46,7 @@ def _ball(radius: float, **sizes: Any) -> Field:
     """A new field: exactly a ball."""
     design = Design(**{"surface_levels": 3, "radiance_levels": 3, "occupancy": 48, "initial_radius": radius, **sizes})
     field = Field(design, {"grey": Sensor("grey", ("L",), (None,))}, {"grey": 1.0}, Region((0.0, 0.0, 0.0), 1.0))
-    sdf = lambda x: field.surface(x, 3)
-    for step in range(3):
-        field.occupancy.update(sdf, 60.0, torch.Generator().manual_seed(step), 1.0)
+    field.occupancy.update(lambda x: field.surface(x, 3), 60.0)
     return field
 
 

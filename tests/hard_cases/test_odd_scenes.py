@@ -427,7 +427,7 @@ def test_matter_before_a_camera_that_no_picture_shows(row: Row, tmp_path: Path) 
     away = np.linalg.norm((far[:3, 3] - field.region.centre) / field.region.radius)
     middle = Camera(1, 1, 40.0, 40.0, 0.0, 0.0)
     ours = float(field.render(middle, far).depth_ray[0, 0]) / field.region.radius
-    field.occupancy.update(field.surface.at(3), 200.0, torch.Generator().manual_seed(0), 1.0)  # by the distance alone
+    field.occupancy.update(field.surface.at(3), 200.0)  # by the distance alone
     usual = float(field.render(middle, far).depth_ray[0, 0]) / field.region.radius
     row(
         f"matter before a camera that no picture shows, {away:.1f} radii from the centre",
@@ -457,7 +457,7 @@ def test_matter_that_no_picture_reaches(row: Row, tmp_path: Path) -> None:
         return heights, np.stack([field.render(wide, pose).channels["rgb"] for pose in lenses])
 
     (top, bottom), seen = looks()
-    field.occupancy.update(field.surface.at(3), 200.0, torch.Generator().manual_seed(0), 1.0)  # by the distance alone
+    field.occupancy.update(field.surface.at(3), 200.0)  # by the distance alone
     (usual_top, usual_bottom), usual = looks()
     row(
         "a ball seen from above alone, its lower half from the side",
