@@ -2,12 +2,14 @@
 rays that none of them has learned from.
 
 A copy that can do without something has learned to by then. (Asking only what the shader loses when something is taken from it would not
-tell: it uses what it is given, needed or not.)
+tell: it uses what it is given, needed or not.) Copies learn from many rays, some in each step: from few they learn those by heart, most of
+all where they see directions. Many rays judge, too: errors have long tails.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +23,7 @@ from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.optimiser import Adam
 
+_LOOKS, _RAYS = 8, 2048  # that judge, of so many rays of a modality each, and as many, half as large, that copies learn from in turn
 _STEPS = 40
 _RATE = 4e-3
 
@@ -55,15 +58,18 @@ def look(
 
 
 def look_twice(
-    field: Field, measurements: Measurements, rays: int, sampling: kernels.Sampling, random: np.random.Generator, held: Tensor | None
-) -> tuple[Look, Look]:
-    """What copies learn from, half as many rays, and what judges them; ``held``: tiles that judge and are not learned from."""
+    field: Field, measurements: Measurements, sampling: kernels.Sampling, random: np.random.Generator, held: Tensor | None
+) -> tuple[list[Look], list[Look]]:
+    """What copies learn from, and what judges them; ``held``: tiles that judge and are not learned from."""
     learned, judged = selections(measurements, held)
-    return look(field, measurements, rays // 2, sampling, random, learned), look(field, measurements, rays, sampling, random, judged)
+    return (
+        [look(field, measurements, _RAYS // 2, sampling, random, learned) for _ in range(_LOOKS)],
+        [look(field, measurements, _RAYS, sampling, random, judged) for _ in range(_LOOKS)],
+    )
 
 
-def squared_errors(shader: Shader, learned: Look, judged: Look, degree: int, mirrors: bool = True) -> Tensor:
-    """Squared errors of the numbers of one look, (M,), by a copy of the shader that has learned on from another.
+def squared_errors(shader: Shader, learned: Sequence[Look], judged: Sequence[Look], degree: int, mirrors: bool = True) -> list[Tensor]:
+    """Squared errors of the numbers of looks, (M,) each, by a copy of the shader that has learned on from others.
 
     Args:
         degree: of the harmonics of the direction that the copy sees. mirrors: whether mirrored light is added to its own.
@@ -72,11 +78,11 @@ def squared_errors(shader: Shader, learned: Look, judged: Look, degree: int, mir
     parameters = dict(candidate.named_parameters())
     optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
     for step in range(_STEPS):
-        loss, _ = _compare(candidate, learned, degree, mirrors)
+        loss, _ = _compare(candidate, learned[step % len(learned)], degree, mirrors)
         loss.backward()
         optimiser.step(1.0 - step / _STEPS)
     with torch.no_grad():
-        return _compare(candidate, judged, degree, mirrors)[1]
+        return [_compare(candidate, seen, degree, mirrors)[1] for seen in judged]
 
 
 def _compare(shader: Shader, seen: Look, degree: int, mirrors: bool) -> tuple[Tensor, Tensor]:

@@ -6,6 +6,7 @@ Rays are compared with what was measured, see ``candidates``: of views that are 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import RadianceRecipe
 
 DEGREES = 3  # of spherical harmonics
-_RAYS = 2048  # per modality, to judge, and half as many to learn from
+_RAYS = 2048  # per modality, that exposures are asked of
 _SURE = 2.0  # standard errors
 
 
@@ -45,7 +46,7 @@ def decide(
     random = np.random.default_rng((seed, 2))
     judged = look(field, measurements, _RAYS, sampling, random)
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, *look_twice(field, measurements, _RAYS, sampling, random, held))
+        errors = errors_by_degree(field.shader, *look_twice(field, measurements, sampling, random, held))
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         asked = recipe.view_dependence
@@ -91,15 +92,19 @@ def _exposure(field: Field, judged: Look, measurements: Measurements, recipe: Ra
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
-def errors_by_degree(shader: Shader, learned: Look, judged: Look) -> dict[str, Tensor]:
+def errors_by_degree(shader: Shader, learned: Sequence[Look], judged: Sequence[Look]) -> dict[str, Tensor]:
     """Squared errors of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
 
     Returns:
         by modality, (DEGREES + 1, N); N = 0 where every number is clipped.
     """
-    squared = torch.stack([squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)])
-    parts = judged.batch.parts.items()
-    return {name: squared[:, numbers][:, judged.usable[numbers]] for name, (_, numbers) in parts}
+    by_degree = [squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)]
+    out: dict[str, list[Tensor]] = {name: [] for name in judged[0].batch.parts}
+    for seen, *of_look in zip(judged, *by_degree, strict=True):
+        squared, usable = torch.stack(of_look), seen.usable
+        for name, (_, numbers) in seen.batch.parts.items():
+            out[name].append(squared[:, numbers][:, usable[numbers]])
+    return {name: torch.cat(parts, 1) for name, parts in out.items()}
 
 
 def degree_needed(errors: Tensor, worth: float) -> int:

@@ -11,7 +11,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.fitting.candidates import look, look_twice, squared_errors
+from mmsynth.fitting.candidates import Look, look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.decisions import DEGREES
 from mmsynth.fitting.measurements import Batch, Measurements, draw
@@ -93,9 +93,8 @@ def decide_light(
     if not field.shines:
         return switch(False, "from no direction surfaces are brighter than from others")
     random = np.random.default_rng((seed, 10))
-    learned, judged = look_twice(field, measurements, _RAYS, sampling, random, held)
-    relative = judged.batch.measured.level.square()[judged.usable]
-    lit, unlit = (squared_errors(field.shader, learned, judged, DEGREES, mirrors)[judged.usable] / relative for mirrors in (True, False))
+    learned, judged = look_twice(field, measurements, sampling, random, held)
+    lit, unlit = (_relative(squared_errors(field.shader, learned, judged, DEGREES, mirrors), judged) for mirrors in (True, False))
     whole = float(unlit.mean())
     saved, unsure = (0.0, 0.0) if whole == 0 else (1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole)
     lamps = keep_bright_lamps(field, measurements, sampling, seed)
@@ -104,6 +103,11 @@ def decide_light(
         return switch(True, f"asked for by the recipe; {why}")
     worth = max(recipe.light_min_improvement, _SURE * unsure)
     return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.1%} asked for")
+
+
+def _relative(squared: list[Tensor], judged: list[Look]) -> Tensor:
+    """Of the numbers of looks that can be judged."""
+    return torch.cat([(s / seen.batch.measured.level.square())[seen.usable] for s, seen in zip(squared, judged, strict=True)])
 
 
 @torch.no_grad()

@@ -65,7 +65,7 @@ class RadianceRecipe(_Section):
         "auto", "Degree of the spherical harmonics of radiance over directions; auto: views judge that are held out until then."
     )
     view_dependence_min_improvement: float = _key(
-        0.05, "Share of the error that a higher degree must save [1], where the degree is auto.", ge=0
+        0.03, "Share of the error that a higher degree must save [1], where the degree is auto.", ge=0
     )
     light: Switch = _key("auto", "Lamps that surfaces mirror: highlights, and their polarization, by place, normal and roughness.")
     light_min_improvement: float = _key(

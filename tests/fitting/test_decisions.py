@@ -41,38 +41,56 @@ def test_one_odd_frame_is_no_exposure() -> None:
     assert found < 0.01
 
 
-@pytest.mark.parametrize("needed", [0, 1, 3])
-def test_the_degree_that_light_has_is_found(needed: int) -> None:
-    """One grey modality whose light is a harmonic of the direction, and a shader that was taught it with all directions."""
-    torch.manual_seed(0)
-    rays = 2048
-    shader = Shader(2, 32, {"grey": Sensor("grey", ("L",), (550.0,))}, {"grey": 1.0})
+def _seen(rays: int, harmonic: int, strength: float = 0.5, noise: float = 0.05) -> Look:
+    """Rays of one grey modality whose light depends on a harmonic of the direction of this degree, on nothing else, and has noise."""
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=1)
+    x, y, _ = directions.unbind(1)
     ones, every = torch.ones(rays), torch.arange(rays)
+    light = 1.0 + strength * {0: 0 * x, 1: x, 3: x * (x * x - 3 * y * y)}[harmonic] + noise * torch.randn(rays)
+    batch = Batch(
+        origins=torch.zeros(rays, 3), directions=directions, frame=0 * every,
+        measured=kernels.Measured(light, every, 0 * every, torch.empty(0, 3), ones, 9 * ones, ones / rays),
+        parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"), ray_weight=ones, jitter=0 * ones, tile=0 * every,
+    )  # fmt: skip
+    hits = kernels.Hits(torch.zeros(rays, 2), ones, ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
+    return Look(batch, hits, torch.zeros(rays))
 
-    def seen() -> Look:
-        directions = torch.nn.functional.normalize(torch.randn(rays, 3), dim=1)
-        x, y, _ = directions.unbind(1)
-        light = 1.0 + 0.5 * {0: 0 * x, 1: x, 3: x * (x * x - 3 * y * y)}[needed] + 0.05 * torch.randn(rays)
-        batch = Batch(
-            origins=torch.zeros(rays, 3), directions=directions, frame=0 * every,
-            measured=kernels.Measured(light, every, 0 * every, torch.empty(0, 3), ones, 9 * ones, ones / rays),
-            parts={"grey": (slice(0, rays), slice(0, rays))}, alpha=ones * float("nan"), ray_weight=ones, jitter=0 * ones, tile=0 * every,
-        )  # fmt: skip
-        hits = kernels.Hits(torch.zeros(rays, 2), ones, ones, torch.full((rays,), -1), ones, ones, torch.tensor(0))
-        return Look(batch, hits, torch.zeros(rays))
 
-    learned, judged = seen(), seen()
-    m, teacher = learned.batch.measured, torch.optim.Adam(shader.parameters(), lr=8e-3)
+def _taught(look: Look) -> Shader:
+    """A shader that has learned a look, with all directions."""
+    shader = Shader(2, 32, {"grey": Sensor("grey", ("L",), (550.0,))}, {"grey": 1.0})
+    m, hits, teacher = look.batch.measured, look.hits, torch.optim.Adam(shader.parameters(), lr=8e-3)
     for _ in range(150):
         teacher.zero_grad()
-        outputs = shader(torch.zeros(rays, 2), learned.batch.directions, DEGREES)
-        kernels.photometric(kernels.predict(outputs, ones, m) - m.target, m).backward()
+        outputs = shader(hits.features, look.batch.directions, DEGREES)
+        kernels.photometric(kernels.predict(outputs, hits.share, m) - m.target, m).backward()
         teacher.step()
+    return shader
+
+
+@pytest.mark.parametrize("needed", [0, 1, 3])
+def test_the_degree_that_light_has_is_found(needed: int) -> None:
+    """A shader that was taught it with all directions."""
+    torch.manual_seed(0)
+    learned, judged = _seen(2048, needed), _seen(2048, needed)
+    shader = _taught(learned)
     before = [p.detach().clone() for p in shader.parameters()]
-    errors = errors_by_degree(shader, learned, judged)["grey"]
+    errors = errors_by_degree(shader, [learned], [judged])["grey"]
     assert len(errors) == DEGREES + 1
     assert degree_needed(errors, worth=0.1) == needed, errors
     assert all(bool((p == q).all()) for p, q in zip(shader.parameters(), before, strict=True))  # copies learned, not the shader
+
+
+def test_a_degree_does_not_hang_on_the_few_rays_that_were_drawn() -> None:
+    """Light of which directions explain a tenth: from one look of some rays the degree is another each time, from many it is that of the
+    light. So decided fits of one scene, by their seed, and those without directions had 0.4 dB less."""
+    torch.manual_seed(0)
+    seen = lambda rays: _seen(rays, 1, 0.3, 0.5)
+    shader = _taught(seen(8192))
+    degrees = lambda looks: [
+        degree_needed(errors_by_degree(shader, *[[seen(n) for _ in range(looks)] for n in (128, 256)])["grey"], 0.03) for _ in range(8)
+    ]
+    assert len(set(degrees(1))) > 1 and set(degrees(64)) == {1}
 
 
 def _errors(*means: float, numbers: int = 2000, noise: float = 0.0) -> torch.Tensor:
