@@ -54,12 +54,14 @@ def unmet_cells(field: Field, measurements: Measurements, random: np.random.Gene
 
 
 def solid_of(field: Field) -> Solid:
-    """Where a field is solid, as it is rendered; in torch, of whose kernels several may run at once."""
+    """Where a field is solid, as it is rendered; by what several threads may call at once."""
     network = field.surface.at(field.sampling.active_surface)
 
     @torch.no_grad()
     def solid(points: np.ndarray) -> np.ndarray:
         at = kernels.contract(torch.from_numpy(points.astype(np.float32)).to(field.device))
+        if at.is_cpu:
+            return kernels.surface_value(at, *network).numpy() <= 0.0
         values = [kernels.reference.surface_value(part, *network) for part in at.split(_POINTS_AT_ONCE)]
         return torch.cat(values).numpy(force=True) <= 0.0
 
