@@ -20,7 +20,7 @@ from mmsynth.sensors.camera import Camera, project, unproject
 
 Solid = Callable[[np.ndarray], np.ndarray]  # points (N, 3) of the normalised frame → (N,) bool; called by several threads at once
 _AT_ONCE = 1 << 14  # cells
-_POINTS_AT_ONCE = 1 << 11  # of which the definition keeps all corners of all levels, in each thread
+_POINTS_AT_ONCE = 1 << 11  # on a GPU, of which the definition keeps all corners of all levels, in each thread
 _GROUPS = 8  # of views, for threads
 _RAYS, _RAYS_AT_ONCE = 1 << 17, 1 << 15  # that look for surfaces
 _LEAST_SHARE = 0.05  # of a ray's light, which a surface must give to be met
@@ -60,7 +60,7 @@ def solid_of(field: Field) -> Solid:
     @torch.no_grad()
     def solid(points: np.ndarray) -> np.ndarray:
         at = kernels.contract(torch.from_numpy(points.astype(np.float32)).to(field.device))
-        if at.is_cpu:
+        if at.is_cpu:  # Triton's kernels are called by one thread alone
             return kernels.surface_value(at, *network).numpy() <= 0.0
         values = [kernels.reference.surface_value(part, *network) for part in at.split(_POINTS_AT_ONCE)]
         return torch.cat(values).numpy(force=True) <= 0.0
