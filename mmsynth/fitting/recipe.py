@@ -113,6 +113,13 @@ class SamplingRecipe(_Section):
         gt=0,
         le=1,
     )
+    roulette: float = _key(
+        0.2,
+        "Gradients of samples, sections and slopes below this share of their root mean square are left to chance, right in the mean [1]; "
+        "0: all are added, as on a GPU.",
+        ge=0,
+        le=1,
+    )
     min_section_weight: float = _key(1e-2, "Weight of a section below which it has no appearance of its own [1].", ge=0, lt=1)
     max_optical_depth: float = _key(3.0, "Optical depth at which a ray ends [1].", gt=0)
     occupancy_resolution: int = _key(96, "Cells of the occupancy grid along each axis [cells].", ge=8, le=256)

@@ -337,7 +337,7 @@ class Trainer:
             field.shader.weights(), light, far_light, rays, kernels.View(degrees, trains), batch.measured,
             kernels.Gains(log_gain, batch.frame),
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, progress),
-            eikonal(field, sampling, self.recipe, progress, drawn.points, drawn.noise), sampling,
+            eikonal(field, sampling, self.recipe, progress, drawn.points, drawn.noise), sampling, self.recipe.sampling.roulette,
         )  # fmt: skip
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:

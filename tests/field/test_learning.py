@@ -35,9 +35,11 @@ SENSORS = {
 RAYS = 300  # more than a chunk
 
 
-def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sparse: bool, extra: int = 0) -> dict[str, Any]:
+def _step(
+    extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sparse: bool, extra: int = 0, seed: int = 0
+) -> dict[str, Any]:
     """What a step takes, on an uneven ball; ``extra`` rays have no measurement."""
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     surface, appearance = Surface(HashGrid(3, 10, 6, 24, extent), 8, (0.5, 1.7 if extent > 1 else 1e9)), HashGrid(3, 11, 8, 32, extent)
     nn.init.normal_(surface.grid.table, std=0.1)
     nn.init.normal_(surface.output_weight, std=0.15)
@@ -80,6 +82,7 @@ def _step(extent: float, lamps: int, far: bool, gains: bool, opacities: bool, sp
             (torch.rand(100, 3) * 2 - 1) * extent, torch.empty(0, 3) if lamps else 0.05 * torch.randn(120, 3), 0.1, 0.08, 0.16, 0.3
         ),
         "sampling": kernels.Sampling(30.0, 2 / 30, 3, 3),
+        "roulette": 0.0,
     }
 
 
@@ -95,7 +98,7 @@ def _told(step: dict[str, Any], dtype: torch.dtype, active: int = 3) -> tuple[ke
     told = kernels.Step(
         grid, network, modules["appearance"].at(active), step["states"], modules["shader"].weights(), modules["light"].network(), far_light,
         tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
-        tuples["eikonal"], step["sampling"],
+        tuples["eikonal"], step["sampling"], step["roulette"],
     )  # fmt: skip
     return told, {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
 
@@ -134,8 +137,33 @@ def test_a_step_is_that_of_the_definition(case: str) -> None:
     assert all(g.abs().max() > 0 for n, g in expected.items()), [n for n, g in expected.items() if not g.abs().max() > 0]
 
 
-def test_sums_do_not_depend_on_threads(use_threads: Callable[[int], None]) -> None:
-    step, results = _step(*CASES["all"]), []
+_PLAYED = ("surface.", "appearance.")  # whose gradients may be estimates
+
+
+@pytest.mark.parametrize(("case", "eikonal"), [("background", 0.1), ("all", 0.1), ("background", 100.0), ("all", 100.0)])
+def test_with_roulette_gradients_are_right_in_the_mean(case: str, eikonal: float) -> None:
+    """Of the surface and the appearance; all others are the same to the bit. With a strong pull the surface's are of taps, nearly all."""
+    along: dict[str, list[float]] = {}
+    for seed in range(40):
+        step = _step(*CASES[case], seed=seed)
+        step["eikonal"] = step["eikonal"]._replace(weight=eikonal)
+        (exact, expected), (found, gradients) = _run(step, torch.float32), _run(step | {"roulette": 0.5}, torch.float32)
+        assert found.loss == exact.loss and torch.equal(found.squared, exact.squared)
+        for name, g in expected.items():
+            if not name.startswith(_PLAYED):
+                assert torch.equal(gradients[name], g), name
+                continue
+            off, size = (gradients[name] - g).double(), g.double().square().sum()
+            along.setdefault(name, []).append(((off * g).sum() / size).item())
+            assert 0 < off.square().sum() < 0.3 * size, name
+    for name, parts in along.items():
+        mean, unsure = np.mean(parts), np.std(parts) / len(parts) ** 0.5
+        assert abs(mean) < 4 * unsure and unsure < 0.02, (name, mean, unsure)
+
+
+@pytest.mark.parametrize("roulette", [0.0, 0.3])
+def test_sums_do_not_depend_on_threads(roulette: float, use_threads: Callable[[int], None]) -> None:
+    step, results = _step(*CASES["all"]) | {"roulette": roulette}, []
     for threads in (1, 2, 5):
         use_threads(threads)
         results.append(_run(step, torch.float32))

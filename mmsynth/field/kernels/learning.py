@@ -50,7 +50,7 @@ def learn(step: Step) -> Learned:
 
     It is the photometric loss (see ``compare``), ``Opacities`` and ``Eikonal``.
     """
-    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, _ = step
     count = len(rays.origins)
     hits = reference.trace(grid, network, appearance, states, rays, sampling)
     ray = rays_of(hits.behind, len(hits.share))

@@ -265,6 +265,9 @@ class Step(NamedTuple):
     Attributes:
         grid, network, appearance, states, sampling: see ``reference.trace``. far_light: (F,), features of the light that passes
             everything, empty: it is black. rays: their places have no gradient; those from some number on may have no measurements.
+        roulette: gradients of tables' rows, and those of the weights behind them, may be estimates that are right in the mean: of rows
+            below this share of the root mean square of all of them, some are left out, and others larger (see ``cpu.roulette``). 0: all
+            are added, which the definition and a GPU always do.
     """
 
     grid: GridTable
@@ -281,6 +284,7 @@ class Step(NamedTuple):
     opacities: Opacities
     eikonal: Eikonal
     sampling: Sampling
+    roulette: float = 0.0
 
 
 class Arranged(NamedTuple):

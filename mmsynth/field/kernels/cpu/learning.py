@@ -18,10 +18,11 @@ from mmsynth.field.kernels.cpu import shading
 from mmsynth.field.kernels.cpu.blocks import scatter_block, surface_block_backward
 from mmsynth.field.kernels.cpu.drawing import draw_chunk, drawing_tasks
 from mmsynth.field.kernels.cpu.jit import kernel, part
-from mmsynth.field.kernels.cpu.marching import CHUNK, composite, find_sections, march_rays
+from mmsynth.field.kernels.cpu.marching import CAPACITY, CHUNK, composite, find_sections, march_rays
 from mmsynth.field.kernels.cpu.matrices import add_sum, add_sums
 from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backward, see_mirrors
 from mmsynth.field.kernels.cpu.optimiser import take_parts
+from mmsynth.field.kernels.cpu.roulette import first_chance, least_of, play
 from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
 from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
 from mmsynth.field.kernels.cpu.stack import on_stack
@@ -34,11 +35,12 @@ _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
 _MOSTLY_BLOCKED = _f(MOSTLY_BLOCKED)
 _of_rays = on_stack(types.float32, CHUNK)
+_of_sections = on_stack(types.float32, CAPACITY)
 
 
 class TableStore(NamedTuple):
-    """What tables learn from, a slot per chunk of rays: rows (see ``blocks``) of the samples that have a gradient, and of the sections; how
-    many; what the gradients of the surface's weights follow from."""
+    """What tables learn from, a slot per chunk of rays: rows (see ``blocks``) of samples and of sections that have a gradient and stay in
+    the game (see ``roulette``); how many; what the gradients of the surface's weights follow from."""
 
     block: np.ndarray
     samples: np.ndarray
@@ -71,8 +73,8 @@ class WeightGradients(NamedTuple):
 @part()
 def _learn_rays(  # type: ignore[no-untyped-def]
     chunk, slot, begin, count, total, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light,
-    view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored,
-    g_gain,
+    view, measured, gain, opacities, eikonal, roulette, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
+    g_mirrored, g_gain,
 ):  # fmt: skip
     """All of a chunk of rays, of which ``begin`` is the first: its loss."""
     s, sharpness = scratch, sampling.sharpness
@@ -93,7 +95,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
     taps.used[chunk, 0] = 0
     taps.pulled_out[chunk], taps.bias_out[chunk] = _ZERO, _ZERO
     shines, trains = len(lamps.position) > 0, view.trains_geometry[begin:end]
-    factor = eikonal.weight / _f(max(asked, 1))
+    of_pull = eikonal.weight / _f(max(asked, 1))
     if shines:
         out.first[chunk], out.first_bias[chunk], out.second[chunk], out.second_bias[chunk] = _ZERO, _ZERO, _ZERO, _ZERO
         out.position[chunk], out.spectrum[chunk] = _ZERO, _ZERO
@@ -125,11 +127,11 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             mix_backward(sub, sub + some, far_light, rows, share, opacity, behind, s.mixed_share[slot], g_features, g_share, out.far[chunk])
         if shines:
             loss += mirrors_backward(
-                sub, some, n, first, begin, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor,
-                g_mirrored, out,
+                sub, some, n, first, begin, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, of_pull,
+                roulette, g_mirrored, out,
             )  # fmt: skip
     if not shines:
-        loss += learn_met(begin, count, total, here, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps)
+        loss += learn_met(begin, count, total, here, depth, eikonal, of_pull, roulette, grid, surface, scratch, slot, chunk, taps)
     if len(opacities.target):
         for i in range(count):
             off = opacity[i] - opacities.target[begin + i]
@@ -144,7 +146,8 @@ def _learn_rays(  # type: ignore[no-untyped-def]
                 g_share[which * CHUNK + i] += pull
     rays_backward(0, count, slot, behind, g_features, g_share, rows, shown.reshape(2 * CHUNK), sharpness, appearance.active, store)
     kept.pulled_out[chunk], kept.bias_out[chunk] = _ZERO, _ZERO
-    n = _keep(store, kept, slot, chunk, FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active)
+    widths = FIRST_FEATURE_ROW + FEATURES * grid.active, FIRST_FEATURE_ROW + FEATURES * appearance.active
+    n = _keep(store, kept, slot, chunk, roulette, *widths)
     surface_block_backward(
         kept.block[chunk], store.gates[slot], store.sdf[slot], n, grid.active, surface, kept.pulled_out[chunk], kept.bias_out[chunk]
     )
@@ -152,34 +155,57 @@ def _learn_rays(  # type: ignore[no-untyped-def]
 
 
 @part()
-def _keep(store, kept, slot, chunk, width, s_width):  # type: ignore[no-untyped-def]
-    """Keep what the tables learn from: the first columns of samples that have a gradient (how many), and of sections. Gates and
-    gradients of these samples move to the front of their arrays."""
+def _keep(store, kept, slot, chunk, roulette, width, s_width):  # type: ignore[no-untyped-def]
+    """Keep what the tables learn from: the first columns of samples (how many), and of sections. Gates and gradients of these samples
+    move to the front of their arrays."""
     sdf, block, gates, out = store.sdf[slot], store.block[slot], store.gates[slot], kept.block[chunk]
-    n = np.int64(0)
-    for i in range(store.samples[slot, 0]):
-        if sdf[i] == _ZERO:
+    n, samples = np.int64(0), store.samples[slot, 0]
+    least = least_of(sdf, samples, roulette)
+    chance = first_chance(least)
+    for i in range(samples):
+        factor, chance = play(abs(sdf[i]), least, chance)
+        pull = sdf[i] * factor
+        if pull == _ZERO:
             continue
         for j in range(width):
             out[n, j] = block[i, j]
         if n < i:
             for j in range(gates.shape[1]):
                 gates[n, j] = gates[i, j]
-            sdf[n] = sdf[i]
+        sdf[n] = pull
         n += 1
     kept.samples[chunk, 0] = n
-    sections = store.s_count[slot, 0]
-    kept.sections[chunk, 0] = sections
+    s_block, s_out, sections, sizes = store.s_block[slot], kept.s_block[chunk], store.s_count[slot, 0], _of_sections()
     for i in range(sections):
-        for j in range(s_width):
-            kept.s_block[chunk, i, j] = store.s_block[slot, i, j]
+        sizes[i] = _size(s_block[i], s_width)
+    least, some = least_of(sizes, sections, roulette), np.int64(0)
+    chance = first_chance(least)
+    for i in range(sections):
+        factor, chance = play(sizes[i], least, chance)
+        if factor == _ZERO:
+            continue
+        for j in range(FIRST_FEATURE_ROW):
+            s_out[some, j] = s_block[i, j]
+        for j in range(FIRST_FEATURE_ROW, s_width):
+            s_out[some, j] = s_block[i, j] * factor
+        some += 1
+    kept.sections[chunk, 0] = some
     return n
+
+
+@part(fastmath={"contract", "reassoc", "nsz"})
+def _size(row, width):  # type: ignore[no-untyped-def]
+    """Of the gradients of a row's features."""
+    total = _ZERO
+    for j in range(FIRST_FEATURE_ROW, width):
+        total += row[j] * row[j]
+    return _f(math.sqrt(total))
 
 
 @kernel
 def learn_rays(  # type: ignore[no-untyped-def]
     next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured, gain,
-    opacities, eikonal, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    opacities, eikonal, roulette, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
 ):  # fmt: skip
     """See ``learning.learn``: what it leaves per chunk, ``finish`` adds up. Chunks of rays, then points, and then rays of the next step to
     draw, until no task is left.
@@ -197,15 +223,15 @@ def learn_rays(  # type: ignore[no-untyped-def]
             begin = chunk * CHUNK
             out.loss[chunk] = _learn_rays(
                 chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, surface, appearance, layers,
-                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, asked, store, kept, taps, shaded,
-                scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, roulette, asked, store, kept, taps,
+                shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
             )  # fmt: skip
             continue
         begin = (chunk - chunks) * POINTS
         if begin < points:
-            factor = eikonal.weight / _f(max(asked, 1))
+            of_pull, some = eikonal.weight / _f(max(asked, 1)), np.int64(min(POINTS, points - begin))
             out.loss[chunk] = learn_points(
-                chunk, np.int64(min(POINTS, points - begin)), eikonal.points, begin, eikonal, factor, grid, surface, scratch, worker, taps
+                chunk, some, eikonal.points, begin, eikonal, of_pull, roulette, grid, surface, scratch, worker, taps
             )
             continue
         task, first = chunk - chunks - (points + POINTS - 1) // POINTS, drawing_tasks(ahead)

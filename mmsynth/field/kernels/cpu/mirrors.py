@@ -174,8 +174,8 @@ def see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch,
 
 @part()
 def mirrors_backward(  # type: ignore[no-untyped-def]
-    begin, count, n, first, ray0, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, factor, g_mirrored,
-    out
+    begin, count, n, first, ray0, trains, taps, lamps, light, measured, scratch, slot, chunk, grid, surface, eikonal, of_pull,
+    roulette, g_mirrored, out
 ):  # fmt: skip
     """Gradients of ``_see_mirrors``, of whose n points ``first`` is the first block, and the pull at them: its part of the loss."""
     s, behind = scratch, scratch.behind[slot]
@@ -210,8 +210,8 @@ def mirrors_backward(  # type: ignore[no-untyped-def]
             if wide:  # symmetric
                 gx, gy_, gz = velocity(px, py, pz, r, gx, gy_, gz)
             at[i, 0], at[i, 1], at[i, 2] = gx, gy_, gz
-        loss += pull_to_one(found[i], factor, _ONE, at[i])
-    slopes_backward(at, n, eikonal.mirror_epsilon, grid, surface, taps, chunk, scratch.gates[slot], first)
+        loss += pull_to_one(found[i], of_pull, _ONE, at[i])
+    slopes_backward(at, n, eikonal.mirror_epsilon, roulette, grid, surface, taps, chunk, scratch.gates[slot], first)
     add_product(gy.T, h, out.second[chunk], gy.shape[1], n, h.shape[1])
     clear(gh, rows, gh.shape[1])
     add_product(gy, light.second, gh, rows, gy.shape[1], gh.shape[1])

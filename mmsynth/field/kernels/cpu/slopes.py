@@ -11,6 +11,7 @@ from numba import types
 from mmsynth.field.kernels.cpu.blocks import surface_block, surface_block_backward
 from mmsynth.field.kernels.cpu.jit import part
 from mmsynth.field.kernels.cpu.marching import CHUNK, contract
+from mmsynth.field.kernels.cpu.roulette import first_chance, least_of, play
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.learning import TAPS
 
@@ -21,6 +22,7 @@ _TAPS = np.array(TAPS, np.float32)
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
 _of_taps = on_stack(types.float32, 4 * TAPPED)
+_of_points = on_stack(types.float32, MOST_TAPPED)
 
 
 class TapStore(NamedTuple):
@@ -58,12 +60,32 @@ def slopes(at, n, epsilon, grid, surface, taps, slot, gates, found):  # type: ig
 
 
 @part()
-def slopes_backward(g, n, epsilon, grid, surface, taps, slot, gates, first):  # type: ignore[no-untyped-def]
-    """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on."""
+def slopes_backward(g, n, epsilon, roulette, grid, surface, taps, slot, gates, first):  # type: ignore[no-untyped-def]
+    """From gradients g (n, 3) of the slopes, whose taps are kept from ``first`` on: of points that stay in the game (see ``roulette``)
+    both move to the front."""
     scale = _f(math.sqrt(3.0)) / (_f(4.0) * epsilon)
-    values = _of_taps()
-    for begin in range(0, n, TAPPED):
-        count, used = np.int64(min(TAPPED, n - begin)), first + 4 * begin
+    values, sizes, some = _of_taps(), _of_points(), 0
+    for i in range(n):
+        sizes[i] = _f(math.sqrt(g[i, 0] * g[i, 0] + g[i, 1] * g[i, 1] + g[i, 2] * g[i, 2]))
+    least, block = least_of(sizes, n, roulette), taps.block[slot]
+    chance = first_chance(least)
+    for i in range(n):
+        factor, chance = play(sizes[i], least, chance)
+        if factor == _ZERO:
+            continue
+        for a in range(3):
+            g[some, a] = g[i, a] * factor
+        if some < i:
+            for t in range(4):
+                here, there = first + 4 * i + t, first + 4 * some + t
+                for j in range(block.shape[1]):
+                    block[there, j] = block[here, j]
+                for j in range(gates.shape[1]):
+                    gates[there, j] = gates[here, j]
+        some += 1
+    taps.used[slot, 0] = first + 4 * some
+    for begin in range(0, some, TAPPED):
+        count, used = np.int64(min(TAPPED, some - begin)), first + 4 * begin
         for i in range(count):
             for t in range(4):
                 total = _ZERO
@@ -93,7 +115,7 @@ def is_within(p):  # type: ignore[no-untyped-def]
 
 
 @part()
-def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, scratch, slot, taps):  # type: ignore[no-untyped-def]
+def learn_points(chunk, count, points, begin, eikonal, of_pull, roulette, grid, surface, scratch, slot, taps):  # type: ignore[no-untyped-def]
     """The pull at some of the points of all space: its part of the loss."""
     at, found, g = points[begin : begin + count], scratch.found[slot], scratch.at[slot]
     taps.used[chunk, 0] = 0
@@ -102,13 +124,13 @@ def learn_points(chunk, count, points, begin, eikonal, factor, grid, surface, sc
     loss = 0.0
     for i in range(count):
         g[i, 0], g[i, 1], g[i, 2] = _ZERO, _ZERO, _ZERO
-        loss += pull_to_one(found[i], factor, eikonal.shallow if is_within(at[i]) else _ONE, g[i])
-    slopes_backward(g, count, eikonal.epsilon, grid, surface, taps, chunk, scratch.gates[slot], 0)
+        loss += pull_to_one(found[i], of_pull, eikonal.shallow if is_within(at[i]) else _ONE, g[i])
+    slopes_backward(g, count, eikonal.epsilon, roulette, grid, surface, taps, chunk, scratch.gates[slot], 0)
     return loss
 
 
 @part()
-def learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface, scratch, slot, chunk, taps):  # type: ignore[no-untyped-def]
+def learn_met(begin, count, total, rays, depth, eikonal, of_pull, roulette, grid, surface, scratch, slot, chunk, taps):  # type: ignore[no-untyped-def]
     """The pull near the surfaces that some of the rays meet (see ``learning.asked_rays``): its part of the loss."""
     wide, n, asked = grid.extent > _ONE, np.int64(0), np.int64(min(len(eikonal.noise), total))
     at, found, shallow = scratch.at[slot], scratch.found[slot], scratch.shallow[slot]
@@ -131,6 +153,6 @@ def learn_met(begin, count, total, rays, depth, eikonal, factor, grid, surface, 
     loss = 0.0
     for i in range(n):
         at[i, 0], at[i, 1], at[i, 2] = _ZERO, _ZERO, _ZERO
-        loss += pull_to_one(found[i], factor, shallow[i], at[i])
-    slopes_backward(at, n, eikonal.epsilon, grid, surface, taps, chunk, scratch.gates[slot], 0)
+        loss += pull_to_one(found[i], of_pull, shallow[i], at[i])
+    slopes_backward(at, n, eikonal.epsilon, roulette, grid, surface, taps, chunk, scratch.gates[slot], 0)
     return loss

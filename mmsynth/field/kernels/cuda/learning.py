@@ -109,7 +109,7 @@ def learn_all(step: Step, of_shader: Tensor, of_light: Tensor) -> tuple[Tensor, 
     Returns:
         the loss (n,) float64, to be summed; squared and samples, see ``Learned``.
     """
-    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling = step
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, _ = step
     with torch.enable_grad():
         hits = trace(grid, network, appearance, states, rays, sampling)
     features, share, shines = hits.features.detach(), hits.share.detach(), len(light.used) > 0
