@@ -25,7 +25,7 @@ _ZERO, _ONE, _TWO, _THREE, _SIX = _f(0.0), _f(1.0), _f(2.0), _f(3.0), _f(6.0)
 
 
 @inlined()
-def _scramble(x):  # type: ignore[no-untyped-def]
+def scramble(x):  # type: ignore[no-untyped-def]
     """See ``drawing.scramble``."""
     x = _u(_u(x ^ _u(x >> _u(16))) * _u(0x7FEB352D))
     x = _u(_u(x ^ _u(x >> _u(15))) * _u(0x846CA68B))
@@ -35,8 +35,8 @@ def _scramble(x):  # type: ignore[no-untyped-def]
 @inlined()
 def _bits(key, number, purpose):  # type: ignore[no-untyped-def]
     """See ``drawing.random_bits``; as int64."""
-    mixed = _scramble(_u(np.int64(number) + np.int64(key[0])))
-    return np.int64(_scramble(_u(mixed ^ _u(np.int64(key[1]) + purpose * PURPOSE_STRIDE))))
+    mixed = scramble(_u(np.int64(number) + np.int64(key[0])))
+    return np.int64(scramble(_u(mixed ^ _u(np.int64(key[1]) + purpose * PURPOSE_STRIDE))))
 
 
 @part()

@@ -14,11 +14,11 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from mmsynth.field.kernels.cpu.drawing import scramble
 from mmsynth.field.kernels.cpu.jit import inlined, part
 
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
-_FIRST, _SECOND = np.uint32(0x7FEB352D), np.uint32(0x846CA68B)
 
 
 @intrinsic
@@ -29,8 +29,7 @@ def _bits(typingctx, number):  # type: ignore[no-untyped-def]
 
 @part()
 def least_of(sizes, n, share):  # type: ignore[no-untyped-def]
-    """The size below which chance decides: ``share`` of the root mean square of those of n rows that are not 0; what they have of signs
-    does not matter."""
+    """The size below which chance decides: ``share`` of the root mean square of those of n rows that are not 0, of either sign."""
     squares, some = 0.0, 0
     for i in range(n):
         squares += np.float64(sizes[i]) * np.float64(sizes[i])
@@ -40,12 +39,8 @@ def least_of(sizes, n, share):  # type: ignore[no-untyped-def]
 
 @part()
 def first_chance(least):  # type: ignore[no-untyped-def]
-    """Where chance begins, in [0, 1): a hash (Wellons' lowbias32) of the bits of a size, so that the same step is the same to the bit."""
-    x = _bits(least)
-    x = np.uint32((x ^ (x >> np.uint32(16))) * _FIRST)
-    x = np.uint32((x ^ (x >> np.uint32(15))) * _SECOND)
-    x = np.uint32(x ^ (x >> np.uint32(16)))
-    return _f(x >> np.uint32(8)) * _f(2.0**-24)
+    """Where chance begins, in [0, 1): scrambled from the bits of a size, so that the same step is the same to the bit."""
+    return _f(scramble(_bits(least)) >> np.uint32(8)) * _f(2.0**-24)
 
 
 @inlined()
