@@ -11,7 +11,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.fitting.candidates import Look, look, look_twice, squared_errors
+from mmsynth.fitting.candidates import look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.decisions import DEGREES
 from mmsynth.fitting.measurements import Batch, Measurements, draw
@@ -85,8 +85,8 @@ def decide_light(
 ) -> Choice[bool]:
     """Whether the lamps of a field that has learned with them are worth it.
 
-    Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``. ``held``: tiles of the
-    views that judge, see ``held_out``.
+    Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``. The modality counts that lamps
+    save most of: of few full-size views, that is the one behind analysers. ``held``: tiles of the views that judge, see ``held_out``.
     """
     if recipe.light == "off":
         return switch(False, "asked for by the recipe")
@@ -94,20 +94,32 @@ def decide_light(
         return switch(False, "from no direction surfaces are brighter than from others")
     random = np.random.default_rng((seed, 10))
     learned, judged = look_twice(field, measurements, sampling, random, held)
-    lit, unlit = (_relative(squared_errors(field.shader, learned, judged, DEGREES, mirrors), judged) for mirrors in (True, False))
-    whole = float(unlit.mean())
-    saved, unsure = (0.0, 0.0) if whole == 0 else (1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole)
+    usable, level, output = (
+        torch.cat(parts)
+        for parts in zip(*((seen.usable, seen.batch.measured.level, seen.batch.measured.output) for seen in judged), strict=True)
+    )
+    lit, unlit = (torch.cat(squared_errors(field.shader, learned, judged, DEGREES, mirrors)) / level.square() for mirrors in (True, False))
+    of_each: dict[str, tuple[float, float]] = {}
+    for name in measurements:
+        columns = field.shader.columns[name]
+        own = usable & (output >= columns.start) & (output < columns.stop)
+        of_each[name] = _saved(lit[own], unlit[own])
+    modality = max(of_each, key=lambda name: of_each[name][0])
+    saved, unsure = of_each[modality]
     lamps = keep_bright_lamps(field, measurements, sampling, seed)
-    why = f"{lamps} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of the error of rays not learned from"
+    why = f"{lamps} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of {modality}'s error at rays not learned from"
     if recipe.light == "on":
         return switch(True, f"asked for by the recipe; {why}")
     worth = max(recipe.light_min_improvement, _SURE * unsure)
     return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.1%} asked for")
 
 
-def _relative(squared: list[Tensor], judged: list[Look]) -> Tensor:
-    """Of the numbers of looks that can be judged."""
-    return torch.cat([(s / seen.batch.measured.level.square())[seen.usable] for s, seen in zip(squared, judged, strict=True)])
+def _saved(lit: Tensor, unlit: Tensor) -> tuple[float, float]:
+    """What lamps save of the mean of errors (N,), and the standard error of that."""
+    whole = float(unlit.mean()) if len(unlit) else 0.0
+    if whole == 0:
+        return 0.0, 0.0
+    return 1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole
 
 
 @torch.no_grad()

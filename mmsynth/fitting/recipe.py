@@ -70,7 +70,7 @@ class RadianceRecipe(_Section):
     light: Switch = _key("auto", "Lamps that surfaces mirror: highlights, and their polarization, by place, normal and roughness.")
     light_min_improvement: float = _key(
         0.02,
-        "Share of the error of rays not learned from that lamps must save [1], where light is auto; two standard errors at least.",
+        "Share of a modality's error at rays not learned from that lamps must save [1], where light is auto; two standard errors at least.",
         ge=0,
     )
     exposure: Switch = _key("auto", "An exposure factor of every frame.")
