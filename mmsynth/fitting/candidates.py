@@ -85,6 +85,17 @@ def squared_errors(shader: Shader, learned: Sequence[Look], judged: Sequence[Loo
         return [_compare(candidate, seen, degree, mirrors)[1] for seen in judged]
 
 
+def by_modality(squared: Sequence[Sequence[Tensor]], judged: Sequence[Look]) -> dict[str, Tensor]:
+    """Errors of several copies, each as ``squared_errors`` gives them, by modality: (copies, N) at the numbers that can be judged; N = 0
+    where every number is clipped."""
+    out: dict[str, list[Tensor]] = {name: [] for name in judged[0].batch.parts}
+    for seen, *of_look in zip(judged, *squared, strict=True):
+        errors, usable = torch.stack(of_look), seen.usable
+        for name, (_, numbers) in seen.batch.parts.items():
+            out[name].append(errors[:, numbers][:, usable[numbers]])
+    return {name: torch.cat(parts, 1) for name, parts in out.items()}
+
+
 def _compare(shader: Shader, seen: Look, degree: int, mirrors: bool) -> tuple[Tensor, Tensor]:
     hits, batch = seen.hits, seen.batch
     degrees = torch.full((len(batch.origins),), degree, device=batch.origins.device)

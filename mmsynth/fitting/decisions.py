@@ -17,7 +17,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.candidates import Look, look, look_twice, squared_errors
+from mmsynth.fitting.candidates import Look, by_modality, look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.recipe import RadianceRecipe
@@ -98,13 +98,7 @@ def errors_by_degree(shader: Shader, learned: Sequence[Look], judged: Sequence[L
     Returns:
         by modality, (DEGREES + 1, N); N = 0 where every number is clipped.
     """
-    by_degree = [squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)]
-    out: dict[str, list[Tensor]] = {name: [] for name in judged[0].batch.parts}
-    for seen, *of_look in zip(judged, *by_degree, strict=True):
-        squared, usable = torch.stack(of_look), seen.usable
-        for name, (_, numbers) in seen.batch.parts.items():
-            out[name].append(squared[:, numbers][:, usable[numbers]])
-    return {name: torch.cat(parts, 1) for name, parts in out.items()}
+    return by_modality([squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)], judged)
 
 
 def degree_needed(errors: Tensor, worth: float) -> int:

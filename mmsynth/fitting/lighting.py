@@ -11,7 +11,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.fitting.candidates import look, look_twice, squared_errors
+from mmsynth.fitting.candidates import by_modality, look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.decisions import DEGREES
 from mmsynth.fitting.measurements import Batch, Measurements, draw
@@ -94,16 +94,8 @@ def decide_light(
         return switch(False, "from no direction surfaces are brighter than from others")
     random = np.random.default_rng((seed, 10))
     learned, judged = look_twice(field, measurements, sampling, random, held)
-    usable, level, output = (
-        torch.cat(parts)
-        for parts in zip(*((seen.usable, seen.batch.measured.level, seen.batch.measured.output) for seen in judged), strict=True)
-    )
-    lit, unlit = (torch.cat(squared_errors(field.shader, learned, judged, DEGREES, mirrors)) / level.square() for mirrors in (True, False))
-    of_each: dict[str, tuple[float, float]] = {}
-    for name in measurements:
-        columns = field.shader.columns[name]
-        own = usable & (output >= columns.start) & (output < columns.stop)
-        of_each[name] = _saved(lit[own], unlit[own])
+    errors = by_modality([squared_errors(field.shader, learned, judged, DEGREES, mirrors) for mirrors in (True, False)], judged)
+    of_each = {name: _saved(*own) for name, own in errors.items()}
     modality = max(of_each, key=lambda name: of_each[name][0])
     saved, unsure = of_each[modality]
     lamps = keep_bright_lamps(field, measurements, sampling, seed)
@@ -115,7 +107,7 @@ def decide_light(
 
 
 def _saved(lit: Tensor, unlit: Tensor) -> tuple[float, float]:
-    """What lamps save of the mean of errors (N,), and the standard error of that."""
+    """What lamps save of the mean of errors (N,), N = 0 allowed, and the standard error of that."""
     whole = float(unlit.mean()) if len(unlit) else 0.0
     if whole == 0:
         return 0.0, 0.0

@@ -125,12 +125,12 @@ def test_the_modality_that_lamps_save_most_of_decides(scene: Scene, monkeypatch:
     """A tenth of the polarization's error, at the price of a tenth of rgb's: lamps stay, and by what it says."""
     trainer, sampling = _ready(scene)
     few_looks(monkeypatch, rays=512)
-    pol = trainer.field.shader.columns["pol"]
 
     def errors(shader: Any, learned: list[Look], judged: list[Look], degree: int, mirrors: bool) -> list[torch.Tensor]:
-        of_pol = [(seen.batch.measured.output >= pol.start) & (seen.batch.measured.output < pol.stop) for seen in judged]
-        factors = [torch.where(own, 0.9, 1.1) if mirrors else torch.ones(len(own)) for own in of_pol]
-        return [factor * seen.batch.measured.level.square() for factor, seen in zip(factors, judged, strict=True)]
+        out = [torch.full((len(seen.usable),), 1.1 if mirrors else 1.0) for seen in judged]
+        for of_look, seen in zip(out, judged, strict=True):
+            of_look[seen.batch.parts["pol"][1]] = 0.9 if mirrors else 1.0
+        return out
 
     monkeypatch.setattr(lighting, "squared_errors", errors)
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto"})
