@@ -191,11 +191,14 @@ class DeviceStep:
             self.pool = torch.cuda.graph_pool_handle() if self.field.device.type == "cuda" else None  # memory of graphs goes with them
         self.tables = tables
 
-    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, of_surface: SurfaceRates) -> None:
+    def run(
+        self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, of_surface: SurfaceRates, beta2: float = BETAS[1]
+    ) -> None:
         """A step, of rays where they go by now.
 
         Args:
-            number: of the step, for its random numbers. factor: of all learning rates. of_surface: of the surface's, beside.
+            number: of the step, for its random numbers. factor: of all learning rates. of_surface: of the surface's, beside. beta2: of the
+                surface's network.
         """
         if stage not in self.works:
             self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture, self.pool)
@@ -204,7 +207,8 @@ class DeviceStep:
             self.selection.ends.copy_(self.chosen.ends)
             self.selection.weight.copy_(self.chosen.weight)
         key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
-        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, of_surface, key)
+        betas = BETAS[1], beta2, BETAS[1]
+        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, of_surface, betas, key)
         self.works[stage]()
         self.rays += sum(stage.rays)
         if (number + 1) % _NEWS_EVERY == 0:
@@ -269,12 +273,13 @@ class DeviceStep:
             loss_parts, squared, samples = learn_all(told, of_shader, of_light)
             f = self.flat
             optimiser.check(loss_parts, f.gradient, samples, self.steps, self.told[:4])
-            optimiser.guarded_adam(f.values, f.gradient, (f.first, f.second), f.rates, f.kinds, numbers.factors, self.steps, BETAS, EPSILON)
+            of_kinds = numbers.factors, numbers.beta2
+            optimiser.guarded_adam(f.values, f.gradient, (f.first, f.second), f.rates, f.kinds, of_kinds, self.steps, BETAS[0], EPSILON)
             for name, kind in _TABLES.items():
                 p, moments = self.adam.parameters[name], self.adam.moments[name]
                 optimiser.guarded_adam(
-                    p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, numbers.factors,
-                    self.steps, BETAS, self.adam.epsilons[name], sparse=True,
+                    p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, of_kinds, self.steps,
+                    BETAS[0], self.adam.epsilons[name], sparse=True,
                 )  # fmt: skip
             stepping.tally(drawn, squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)
 

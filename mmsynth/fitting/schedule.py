@@ -7,7 +7,10 @@ from typing import NamedTuple
 
 from mmsynth.field.kernels import Sampling
 from mmsynth.fitting.needs import Needs
+from mmsynth.fitting.optimiser import BETAS
 from mmsynth.fitting.recipe import Recipe
+
+_LONG_MEMORY = 0.999  # β₂ of a thousand steps
 
 
 def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
@@ -58,6 +61,16 @@ def surface_rates(sharpness: float, recipe: Recipe) -> SurfaceRates:
     """
     rates = recipe.schedule
     return SurfaceRates(min(1.0, rates.full_rate_sharpness / sharpness), min(1.0, rates.full_rate_sharpness_table / sharpness))
+
+
+def surface_beta2(progress: float, needs: Needs) -> float:
+    """Adam's β₂ of the surface's network: how long it remembers how large gradients were.
+
+    Once the surface is as sharp as it gets, some networks go to and fro for good: for about as many steps as are remembered gradients are
+    small, so steps get larger, until one is too large and the shader follows the surface to where it went. A long memory ends it. Sooner
+    it would slow down the search for a shape, in which gradients become smaller by themselves.
+    """
+    return _LONG_MEMORY if progress >= needs.sharpness_until else BETAS[1]
 
 
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:

@@ -32,7 +32,15 @@ from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.progress import FitProgress, FitState
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
-from mmsynth.fitting.schedule import is_early, learning_rate_factor, light_looks, samples_of_step, sampling_at, surface_rates
+from mmsynth.fitting.schedule import (
+    is_early,
+    learning_rate_factor,
+    light_looks,
+    samples_of_step,
+    sampling_at,
+    surface_beta2,
+    surface_rates,
+)
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, eikonal_points, opacities
@@ -198,7 +206,8 @@ class Trainer:
         state, done = self.state, self.progress
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
-        step.run(stage, sampling, state.step, learning_rate_factor(done, self.recipe), surface_rates(sampling.sharpness, self.recipe))
+        factor, of_surface = learning_rate_factor(done, self.recipe), surface_rates(sampling.sharpness, self.recipe)
+        step.run(stage, sampling, state.step, factor, of_surface, surface_beta2(done, self.needs))
         self._average()
         state.rays_total += sum(stage.rays)
         state.step += 1
@@ -304,7 +313,8 @@ class Trainer:
         """What a step of the optimiser takes."""
         rates = surface_rates(sampling.sharpness, self.recipe)
         slower = {n: rates.table if n.endswith(".table") else rates.network for n in self.of_surface}
-        return self.optimiser.parts(learning_rate_factor(self.progress, self.recipe), slower)
+        beta2 = dict.fromkeys((n for n in slower if not n.endswith(".table")), surface_beta2(self.progress, self.needs))
+        return self.optimiser.parts(learning_rate_factor(self.progress, self.recipe), slower, beta2)
 
     def _average(self) -> None:
         """Take the parameters into the mean over the last ones, now and then at the end of a fit."""

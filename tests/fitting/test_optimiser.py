@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from mmsynth.field import kernels
 from mmsynth.fitting.optimiser import Adam, Average
 
 
@@ -44,6 +45,24 @@ def test_parameters_have_rates_and_epsilons_of_their_own(dtype: torch.dtype, tol
         assert not any(p.grad.any() for p in ours.values())
     for name, p in ours.items():
         torch.testing.assert_close(p.detach().double(), theirs[name].detach(), atol=tolerance, rtol=0)
+
+
+def test_a_parameter_may_remember_the_size_of_gradients_for_longer() -> None:
+    ours = _parameters(torch.float64)
+    theirs = {name: nn.Parameter(p.detach().clone()) for name, p in ours.items()}
+    mine = Adam(ours, dict.fromkeys(ours, 0.02))
+    groups = [{"params": [theirs["a.table"]], "betas": (0.9, 0.99)}, {"params": [theirs["b"]], "betas": (0.9, 0.999)}]
+    other = torch.optim.Adam(groups, lr=0.02, eps=1e-15)
+    for step in range(5):
+        _gradients(ours, step)
+        for name, p in theirs.items():
+            p.grad = ours[name].grad.clone()
+        for part in mine.parts(1.0, beta2={"b": 0.999}):
+            kernels.adam(*part)
+        mine.count += 1
+        other.step()
+    for name, p in ours.items():
+        torch.testing.assert_close(p.detach(), theirs[name].detach(), atol=1e-14, rtol=0)
 
 
 def test_a_parameter_without_a_gradient_stays() -> None:

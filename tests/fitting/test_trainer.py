@@ -662,6 +662,22 @@ def test_the_learning_rate_rises_and_falls() -> None:
     assert factors[-1] == pytest.approx(0.1)
 
 
+def test_only_the_network_of_a_surface_that_is_sharp_remembers_gradients_for_long(scene: Scene) -> None:
+    trainer = _trainer(scene)
+    sampling = sampling_at(0.5, SMALL, trainer.needs)
+
+    def beta2(progress: float) -> dict[str, float]:
+        trainer.state.step = round(1000 * progress)
+        return {name: part.step.beta2 for name, part in zip(trainer.optimiser.parameters, trainer._update(sampling), strict=True)}
+
+    trainer.steps = 1000
+    assert set(beta2(trainer.needs.sharpness_until - 0.01).values()) == {0.99}
+    assert {name for name, own in beta2(trainer.needs.sharpness_until).items() if own == 0.999} == {
+        "surface.hidden",
+        "surface.output_weight",
+    }
+
+
 def test_late_steps_take_more_samples() -> None:
     samples = np.array([samples_of_step(p, SMALL) for p in np.linspace(0, 1, 101)])
     np.testing.assert_allclose(samples[[0, 50, 100]], [1024, 2048, 4096])

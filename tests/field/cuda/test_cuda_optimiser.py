@@ -30,15 +30,15 @@ def test_adam(device: str, sparse: bool, number: int) -> None:
 
 @pytest.mark.parametrize("each", [False, True])
 def test_the_device_says_whether_and_how_far_to_step(device: str, each: bool) -> None:
-    found, factors = _numbers(device), torch.tensor([2.0, 0.5], device=device)
+    found, of_kinds = _numbers(device), torch.tensor([[2.0, 0.5], [0.99, 0.999]], device=device).unbind()
     expected, kinds = [x.double() for x in found], (torch.arange(COUNT) % 2).to(device, torch.uint8)
-    steps, rates = torch.tensor([1, 3], dtype=torch.int32, device=device), torch.full((COUNT,), 1e-2, device=device)
+    steps, rates = torch.tensor([1, 30], dtype=torch.int32, device=device), torch.full((COUNT,), 1e-2, device=device)
     optimiser.guarded_adam(
-        found[0], found[1], (found[2], found[3]), rates if each else rates[:1], kinds if each else 1, factors, steps, (0.9, 0.99), 1e-15
+        found[0], found[1], (found[2], found[3]), rates if each else rates[:1], kinds if each else 1, of_kinds, steps, 0.9, 1e-15
     )
-    for kind, factor in enumerate((2.0, 0.5) if each else (0.5, 0.5)):
+    for kind, (factor, beta2) in enumerate(((2.0, 0.99), (0.5, 0.999)) if each else ((0.5, 0.999),) * 2):
         parts = [x[kind::2] for x in expected]
-        reference.adam(*parts, AdamStep(1e-2 * factor, 0.9, 0.99, 1e-15, 3))
+        reference.adam(*parts, AdamStep(1e-2 * factor, 0.9, beta2, 1e-15, 30))
         for fast, slow in zip(found, parts, strict=True):
             torch.testing.assert_close(fast[kind::2].double(), slow, atol=1e-6, rtol=1e-5)
 
@@ -57,6 +57,6 @@ def test_a_step_that_is_not_finite_is_not_taken(device: str, wrong: str) -> None
     assert steps.tolist() == [good, 6 + good]
     assert sums.tolist() == [2.0, 2.0 - good, 41.0, 4.5 if good else 1.0]
     one = torch.ones(1, device=device)
-    optimiser.guarded_adam(found[0], found[1], (found[2], found[3]), one, 0, one, steps, (0.9, 0.99), 1e-15)
+    optimiser.guarded_adam(found[0], found[1], (found[2], found[3]), one, 0, (one, 0.99 * one), steps, 0.9, 1e-15)
     assert not found[1].any()
     assert all(torch.equal(a, b) is not good for a, b in zip((found[0], *found[2:]), (before[0], *before[2:]), strict=True))

@@ -39,19 +39,21 @@ def adam_kernel(  # type: ignore[no-untyped-def]
 
 @jit
 def guarded_adam_kernel(  # type: ignore[no-untyped-def]
-    parameter, gradient, first, second, rates, kinds, factors, steps, beta1, beta2, log_beta1, log_beta2, epsilon, count,
+    parameter, gradient, first, second, rates, kinds, factors, betas2, steps, beta1, log_beta1, epsilon, count,
     KIND: tl.constexpr, SPARSE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Rates of the step are rates × factors[kind]. KIND: of all numbers, which have the one rate; -1: each has its own rate and kind."""
+    """Rates of the step are rates × factors[kind], β₂ is betas2[kind]. KIND: of all numbers, which have the one rate; -1: each has its own
+    rate and kind."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = i < count
     good = tl.load(steps) != 0
     number = tl.load(steps + 1).to(tl.float32)
     if KIND < 0:
-        rate = tl.load(rates + i, mask=live, other=0.0) * tl.load(factors + tl.load(kinds + i, mask=live, other=0).to(tl.int32))
+        kind = tl.load(kinds + i, mask=live, other=0).to(tl.int32)
+        rate, beta2 = tl.load(rates + i, mask=live, other=0.0) * tl.load(factors + kind), tl.load(betas2 + kind)
     else:
-        rate = tl.load(rates) * tl.load(factors + KIND)
-    one, two = 1.0 - tl.exp(number * log_beta1), 1.0 - tl.exp(number * log_beta2)
+        rate, beta2 = tl.load(rates) * tl.load(factors + KIND), tl.load(betas2 + KIND)
+    one, two = 1.0 - tl.exp(number * log_beta1), 1.0 - tl.exp(number * tl.log(beta2))
     _move(parameter, gradient, first, second, i, live & good, rate / one, 1.0 / tl.sqrt(two), beta1, beta2, epsilon, SPARSE)
     tl.debug_barrier()
     tl.store(gradient + i, 0.0, mask=live)
@@ -93,13 +95,14 @@ def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, ste
 
 
 def guarded_adam(
-    parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], rates: Tensor, kinds: Tensor | int, factors: Tensor, steps: Tensor,
-    betas: tuple[float, float], epsilon: float, sparse: bool = False,
+    parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], rates: Tensor, kinds: Tensor | int,
+    of_kinds: tuple[Tensor, Tensor], steps: Tensor, beta1: float, epsilon: float, sparse: bool = False,
 ) -> None:  # fmt: skip
     """A step of Adam that the device decides on: parameters and moments stay as they are where ``check`` found it bad; one launch.
 
     Args:
-        rates: (N,), or of all, (1,). kinds: (N,) uint8 or of all: which of ``factors`` (K,) float32 a rate is multiplied by.
+        rates: (N,), or of all, (1,). kinds: (N,) uint8 or of all: which of ``of_kinds``, (K,) float32 each, is theirs: factors that rates
+            are multiplied by, and β₂.
         steps: (2,) int32, of ``check``: whether to step, and the number of the step, 1 at the first.
     """
     count = parameter.numel()
@@ -107,8 +110,8 @@ def guarded_adam(
         each = isinstance(kinds, Tensor)
         with torch.cuda.device_of(parameter), torch.no_grad():
             guarded_adam_kernel[(triton.cdiv(count, _BLOCK),)](
-                parameter, gradient, *moments, rates, kinds if each else rates, factors, steps, *betas, *map(math.log, betas), epsilon,
-                count, -1 if each else kinds, sparse, _BLOCK,
+                parameter, gradient, *moments, rates, kinds if each else rates, *of_kinds, steps, beta1, math.log(beta1), epsilon, count,
+                -1 if each else kinds, sparse, _BLOCK,
             )  # fmt: skip
 
 

@@ -20,22 +20,26 @@ _TWO_PI = 2.0 * math.pi
 
 
 class Numbers(NamedTuple):
-    """What changes from step to step, on the device: sharpness, step (), float64, see ``Sampling``; factors (3,) of learning rates, of the
-    surface's network the second, of its table the third; key (4,) int64 of random numbers, two words for each of two draws."""
+    """What changes from step to step, on the device: sharpness, step (), float64, see ``Sampling``; factors of learning rates and β₂ of
+    Adam, (3,) each: of all, of the surface's network, of its table; key (4,) int64 of random numbers, two words for each of two draws."""
 
     sharpness: Tensor
     step: Tensor
     factors: Tensor
+    beta2: Tensor
     key: Tensor
 
 
 @jit
-def numbers_kernel(sharpness, step, factors, key, a, b, c, d, e, key_0, key_1, key_2, key_3):  # type: ignore[no-untyped-def]
+def numbers_kernel(sharpness, step, factors, beta2, key, a, b, c, d, e, f, g, h, key_0, key_1, key_2, key_3):  # type: ignore[no-untyped-def]
     tl.store(sharpness, a)
     tl.store(step, b)
     tl.store(factors, c)
     tl.store(factors + 1, d)
     tl.store(factors + 2, e)
+    tl.store(beta2, f)
+    tl.store(beta2 + 1, g)
+    tl.store(beta2 + 2, h)
     tl.store(key, key_0)
     tl.store(key + 1, key_1)
     tl.store(key + 2, key_2)
@@ -44,16 +48,18 @@ def numbers_kernel(sharpness, step, factors, key, a, b, c, d, e, key_0, key_1, k
 
 def new_numbers(device: torch.device) -> Numbers:
     of_sampling = torch.zeros(2, dtype=torch.float64, device=device)
-    return Numbers(of_sampling[0], of_sampling[1], torch.zeros(3, device=device), torch.zeros(4, dtype=torch.int64, device=device))
+    of_rates = torch.zeros(2, 3, device=device)
+    return Numbers(of_sampling[0], of_sampling[1], of_rates[0], of_rates[1], torch.zeros(4, dtype=torch.int64, device=device))
 
 
 def set_numbers(
-    numbers: Numbers, sharpness: float, step: float, factor: float, of_surface: tuple[float, float], key: Sequence[int]
-) -> None:
+    numbers: Numbers, sharpness: float, step: float, factor: float, of_surface: tuple[float, float], beta2: tuple[float, float, float],
+    key: Sequence[int],
+) -> None:  # fmt: skip
     """By arguments of a kernel, which are on their way when this returns: nothing waits, and nothing is overwritten too early."""
     with torch.cuda.device_of(numbers.key):
         signed = (word - (word >> 31 << 32) for word in key)  # the same bits, and one kernel for all of them
-        numbers_kernel[(1,)](*numbers, sharpness, step, factor, *(factor * own for own in of_surface), *signed)
+        numbers_kernel[(1,)](*numbers, sharpness, step, factor, *(factor * own for own in of_surface), *beta2, *signed)
 
 
 @jit
