@@ -191,9 +191,7 @@ class DeviceStep:
             self.pool = torch.cuda.graph_pool_handle() if self.field.device.type == "cuda" else None  # memory of graphs goes with them
         self.tables = tables
 
-    def run(
-        self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, of_surface: SurfaceRates, beta2: float = BETAS[1]
-    ) -> None:
+    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, of_surface: SurfaceRates, beta2: float) -> None:
         """A step, of rays where they go by now.
 
         Args:

@@ -39,22 +39,24 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
     stage = step.stage(sampling, 10, decided=True, gains=True, early=True, outside=4)
     before, table = step.flat.values.clone(), field.surface.grid.table.detach().clone()
     for number in (0, 1):  # the last layer of the surface begins with zeros: the hidden one moves with the second step
-        step.run(stage, sampling, number, 1.0, SurfaceRates(0.5, 0.75))
+        step.run(stage, sampling, number, 1.0, SurfaceRates(0.5, 0.75), 0.875)
     news = step.news(wait=True)
     assert news is not None and (news.steps, news.bad) == (2, 0) and news.samples > 2 * sum(stage.rays) and 0.0 < news.loss < 10.0
     assert list(news.errors) == list(step.order) and all(error > 0.0 for error in news.errors.values())
+    assert step.numbers.beta2.tolist() == pytest.approx([0.99, 0.875, 0.99])
     moved = step.flat.values != before
     for name, p in field.named_parameters():
         if not name.endswith("table"):
             begin = step.begins[name]
             assert p.data_ptr() == step.flat.values[begin:].data_ptr(), name
             assert bool(moved[begin : begin + p.numel()].any()), name
+            assert set(step.flat.kinds[begin : begin + p.numel()].tolist()) == {int(name.startswith("surface."))}, name
     assert (field.surface.grid.table != table).any() and not step.flat.gradient.any() and not field.surface.grid.table.grad.any()
     assert 0 < int((trainer.importance.residuals != 1.0).sum()) <= 2 * sum(stage.rays)
     with torch.no_grad():
         field.shader.heads.bias.fill_(torch.nan)
     before, table = step.flat.values.clone(), field.surface.grid.table.detach().clone()
-    step.run(stage, sampling, 2, 1.0, SurfaceRates(0.5, 0.75))
+    step.run(stage, sampling, 2, 1.0, SurfaceRates(0.5, 0.75), 0.875)
     news = step.news(wait=True)
     assert news is not None and (news.steps, news.bad) == (1, 1)
     torch.testing.assert_close(step.flat.values, before, rtol=0, atol=0, equal_nan=True)
