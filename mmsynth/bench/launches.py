@@ -16,7 +16,7 @@ from mmsynth.bench.recording import Launch, recorded_launches
 from mmsynth.bench.tables import Column, Table
 from mmsynth.fitting.device_step import DeviceStep
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.schedule import rates_at, sampling_at, surface_beta2
+from mmsynth.fitting.schedule import sampling_at, surface_beta2, surface_rates
 from mmsynth.fitting.trainer import Trainer
 from mmsynth.packaged import data_folder
 from mmsynth.scene.load import load_scene
@@ -117,8 +117,8 @@ def step_launches(step: DeviceStep, decided: bool, outside: bool = False) -> Cou
     if outside:  # drawn from the pixels that are learned from: what is launched is the same
         step.measurements = replace(step.measurements, empty=step.measurements.chosen)
         stage = replace(stage, outside=tuple(1 for _ in stage.rays))
-    rates, beta2 = rates_at(0.7, sampling.sharpness, step.recipe), surface_beta2(0.7, step.needs)
-    run = lambda: step.run(stage, sampling, 3, rates, beta2)
+    of_surface, beta2 = surface_rates(sampling.sharpness, step.recipe), surface_beta2(0.7, step.needs)
+    run = lambda: step.run(stage, sampling, 3, 1.0, of_surface, beta2)
     count(run)
     return count(run)
 

@@ -31,13 +31,13 @@ from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.needs import SAMPLES_ON_GPU, Needs
 from mmsynth.fitting.optimiser import BETAS, EPSILON, Adam
 from mmsynth.fitting.recipe import Recipe
-from mmsynth.fitting.schedule import Rates, blocked_weight, kind_of, shallow_factor
+from mmsynth.fitting.schedule import SurfaceRates, blocked_weight, shallow_factor
 from mmsynth.fitting.terms import eikonal_points
 
 MOST_RAYS = 1 << 18
 _NEWS_EVERY = 16  # steps, and by as many the host is ahead of the device at the most: a fit of so many seconds ends when it should
 _PER_OCTAVE = 4  # numbers of rays for which there are graphs: within 10 % of what is asked for
-_TABLES = "surface.grid.table", "appearance.table"
+_TABLES = {"surface.grid.table": 2, "appearance.table": 0}  # and which of ``Numbers.factors`` is theirs
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class _Told(NamedTuple):
 
 
 class _Flat(NamedTuple):
-    """Parameters, gradients, moments, rates, one after the other, and which of ``Rates`` multiplies a rate (uint8)."""
+    """Parameters, gradients, moments, rates, one after the other, and which of ``Numbers.factors`` multiplies a rate (uint8)."""
 
     values: Tensor
     gradient: Tensor
@@ -156,7 +156,7 @@ class DeviceStep:
         join = lambda tensors: torch.cat([x.detach().reshape(-1) for x in tensors])
         moments = [[self.adam.moments[n][k] for n in names] for k in (0, 1)]
         rates = [torch.full((size,), self.adam.rates[n], device=self.field.device) for n, size in zip(names, sizes, strict=True)]
-        kinds = [torch.full_like(rate, kind_of(n), dtype=torch.uint8) for n, rate in zip(names, rates, strict=True)]
+        kinds = [torch.full_like(rate, n.startswith("surface."), dtype=torch.uint8) for n, rate in zip(names, rates, strict=True)]
         values = join(parts)
         flat = _Flat(values, torch.zeros_like(values), join(moments[0]), join(moments[1]), torch.cat(rates), torch.cat(kinds))
         begins, begin = {}, 0
@@ -191,11 +191,12 @@ class DeviceStep:
             self.pool = torch.cuda.graph_pool_handle() if self.field.device.type == "cuda" else None  # memory of graphs goes with them
         self.tables = tables
 
-    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, rates: Rates, beta2: float) -> None:
+    def run(self, stage: Stage, sampling: kernels.Sampling, number: int, factor: float, of_surface: SurfaceRates, beta2: float) -> None:
         """A step, of rays where they go by now.
 
         Args:
-            number: of the step, for its random numbers. rates: factors of those of the optimiser. beta2: of the surface's network.
+            number: of the step, for its random numbers. factor: of all learning rates. of_surface: of the surface's, beside. beta2: of the
+                surface's network.
         """
         if stage not in self.works:
             self.works[stage] = Repeated(self._work(stage, sampling), self.field.device, self.capture, self.pool)
@@ -204,8 +205,8 @@ class DeviceStep:
             self.selection.ends.copy_(self.chosen.ends)
             self.selection.weight.copy_(self.chosen.weight)
         key = np.random.SeedSequence((self.seed, 1, number)).generate_state(4).tolist()
-        betas = BETAS[1], beta2, BETAS[1], BETAS[1]  # by kind, as the rates
-        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, rates, betas, key)
+        betas = BETAS[1], beta2, BETAS[1]
+        stepping.set_numbers(self.numbers, sampling.sharpness, sampling.step, factor, of_surface, betas, key)
         self.works[stage]()
         self.rays += sum(stage.rays)
         if (number + 1) % _NEWS_EVERY == 0:
@@ -272,11 +273,11 @@ class DeviceStep:
             optimiser.check(loss_parts, f.gradient, samples, self.steps, self.told[:4])
             of_kinds = numbers.factors, numbers.beta2
             optimiser.guarded_adam(f.values, f.gradient, (f.first, f.second), f.rates, f.kinds, of_kinds, self.steps, BETAS[0], EPSILON)
-            for name in _TABLES:
+            for name, kind in _TABLES.items():
                 p, moments = self.adam.parameters[name], self.adam.moments[name]
                 optimiser.guarded_adam(
-                    p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind_of(name), of_kinds,
-                    self.steps, BETAS[0], self.adam.epsilons[name], sparse=True,
+                    p[: rows[name]], gradient_of(p)[: rows[name]], (moments[0], moments[1]), self.rates[name], kind, of_kinds, self.steps,
+                    BETAS[0], self.adam.epsilons[name], sparse=True,
                 )  # fmt: skip
             stepping.tally(drawn, squared, tables, self.steps, self.where.residuals, self.told[4:], importance.KEPT)
 

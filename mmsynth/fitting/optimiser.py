@@ -37,14 +37,17 @@ class Adam:
         self.moments = {n: [torch.zeros_like(p), torch.zeros_like(p)] for n, p in parameters.items()}
         self.count = 0
 
-    def parts(self, factors: Mapping[str, float], beta2: Mapping[str, float] | None = None) -> list[kernels.AdamPart]:
-        """What a step takes, with rates times ``factors``; ``beta2``: of some, where it is not that of ``BETAS``.
+    def parts(
+        self, factor: float, slower: Mapping[str, float] | None = None, beta2: Mapping[str, float] | None = None
+    ) -> list[kernels.AdamPart]:
+        """What a step takes, with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too; ``beta2``: of
+        some, where it is not that of ``BETAS``.
 
         Who takes it counts it in ``count``.
         """
         parts = []
         for name, p in self.parameters.items():
-            rate = self.rates[name] * factors[name]
+            rate = self.rates[name] * factor * (slower or {}).get(name, 1.0)
             own = (beta2 or {}).get(name, BETAS[1])
             step = kernels.AdamStep(rate, BETAS[0], own, self.epsilons[name], self.count + 1, name in self.sparse)
             first, second = self.moments[name]
@@ -53,8 +56,8 @@ class Adam:
 
     @torch.no_grad()
     def step(self, factor: float, slower: Mapping[str, float] | None = None) -> None:
-        """One step, with all rates times ``factor``, and those of the parameters in ``slower`` times their own, too."""
-        for part in self.parts(dict.fromkeys(self.parameters, factor) | {n: factor * own for n, own in (slower or {}).items()}):
+        """One step, see ``parts``."""
+        for part in self.parts(factor, slower):
             kernels.adam(*part)
         self.count += 1
 

@@ -156,9 +156,7 @@ class ScheduleRecipe(_Section):
     learning_rate_network: float = _key(4e-3, "Adam's rate of the networks [1/step].", gt=0)
     learning_rate_light: float = _key(8e-3, "Adam's rate of the lamps and of how surfaces mirror them [1/step].", gt=0)
     learning_rate_exposure: float = _key(1e-3, "Adam's rate of the log exposures [1/step].", gt=0)
-    learning_rate_end_factor: float = _key(
-        0.5, "Rates at the end, but that of the radiance's table, which stays [rate after the start].", gt=0, le=1
-    )
+    learning_rate_end_factor: float = _key(0.5, "All rates at the end [rate after the start].", gt=0, le=1)
     surface_epsilon: float = _key(
         2e-6,
         "Adam's epsilon of the surface's table: rows of smaller gradients (root mean square; half of them have less) move less than by "

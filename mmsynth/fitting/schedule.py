@@ -45,30 +45,6 @@ def samples_of_step(progress: float, recipe: Recipe) -> float:
     return recipe.sampling.samples_per_step * recipe.sampling.samples_growth ** (progress - 0.5)
 
 
-class Rates(NamedTuple):
-    """Factors of learning rates, by kind of parameter: of the surface's network, of its table, of the radiance's table, and of all
-    others."""
-
-    others: float
-    surface_network: float
-    surface_table: float
-    radiance_table: float
-
-
-def kind_of(name: str) -> int:
-    """Which of ``Rates`` belongs to a parameter of this name."""
-    if name.endswith(".table"):
-        return 2 if name.startswith("surface.") else 3
-    return int(name.startswith("surface."))
-
-
-def rates_at(progress: float, sharpness: float, recipe: Recipe) -> Rates:
-    """They fall, those of networks lest these go to and fro (all numbers of one move at once), that of the surface's table lest the surface
-    trembles. The radiance's stays: what noise moves its rows by, the mean over the last steps takes."""
-    factor, of_surface = learning_rate_factor(progress, recipe), surface_rates(sharpness, recipe)
-    return Rates(factor, factor * of_surface.network, factor * of_surface.table, _rise(progress))
-
-
 class SurfaceRates(NamedTuple):
     """Factors of the learning rates of the surface's network and of its table."""
 
@@ -99,12 +75,9 @@ def surface_beta2(progress: float, needs: Needs) -> float:
 
 def learning_rate_factor(progress: float, recipe: Recipe) -> float:
     """A short linear rise, then level, then exponential decay over the last two thirds."""
+    rise = min(1.0, progress / 0.01)
     fall = max(0.0, (progress - 0.33) / 0.67)
-    return _rise(progress) * math.exp(math.log(recipe.schedule.learning_rate_end_factor) * fall)
-
-
-def _rise(progress: float) -> float:
-    return max(min(1.0, progress / 0.01), 0.02)
+    return max(rise, 0.02) * math.exp(math.log(recipe.schedule.learning_rate_end_factor) * fall)
 
 
 def is_early(progress: float, recipe: Recipe) -> bool:

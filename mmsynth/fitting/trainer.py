@@ -34,12 +34,12 @@ from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.refinement import Refinement, ray_residuals
 from mmsynth.fitting.schedule import (
     is_early,
-    kind_of,
+    learning_rate_factor,
     light_looks,
-    rates_at,
     samples_of_step,
     sampling_at,
     surface_beta2,
+    surface_rates,
 )
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
@@ -93,7 +93,7 @@ class Trainer:
         rates |= {**dict.fromkeys(tables, schedule.learning_rate_grid), _GAINS: schedule.learning_rate_exposure}
         self.optimiser = Adam(parameters, rates, tables, {"surface.grid.table": schedule.surface_epsilon})
         self.average = Average(parameters)
-        self.network_of_surface = [n for n in parameters if n.startswith("surface.") and n not in tables]
+        self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.state = FitState(rays=recipe.sampling.initial_rays, rays_after=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
         self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
@@ -206,8 +206,8 @@ class Trainer:
         state, done = self.state, self.progress
         early = is_early(done, self.recipe)
         stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
-        rates = rates_at(done, sampling.sharpness, self.recipe)
-        step.run(stage, sampling, state.step, rates, surface_beta2(done, self.needs))
+        factor, of_surface = learning_rate_factor(done, self.recipe), surface_rates(sampling.sharpness, self.recipe)
+        step.run(stage, sampling, state.step, factor, of_surface, surface_beta2(done, self.needs))
         self._average()
         state.rays_total += sum(stage.rays)
         state.step += 1
@@ -311,9 +311,10 @@ class Trainer:
 
     def _update(self, sampling: kernels.Sampling) -> list[kernels.AdamPart]:
         """What a step of the optimiser takes."""
-        rates = rates_at(self.progress, sampling.sharpness, self.recipe)
-        factors = {name: rates[kind_of(name)] for name in self.optimiser.parameters}
-        return self.optimiser.parts(factors, dict.fromkeys(self.network_of_surface, surface_beta2(self.progress, self.needs)))
+        rates = surface_rates(sampling.sharpness, self.recipe)
+        slower = {n: rates.table if n.endswith(".table") else rates.network for n in self.of_surface}
+        beta2 = dict.fromkeys((n for n in slower if not n.endswith(".table")), surface_beta2(self.progress, self.needs))
+        return self.optimiser.parts(learning_rate_factor(self.progress, self.recipe), slower, beta2)
 
     def _average(self) -> None:
         """Take the parameters into the mean over the last ones, now and then at the end of a fit."""

@@ -57,7 +57,7 @@ def test_a_parameter_may_remember_the_size_of_gradients_for_longer() -> None:
         _gradients(ours, step)
         for name, p in theirs.items():
             p.grad = ours[name].grad.clone()
-        for part in mine.parts(dict.fromkeys(ours, 1.0), {"b": 0.999}):
+        for part in mine.parts(1.0, beta2={"b": 0.999}):
             kernels.adam(*part)
         mine.count += 1
         other.step()

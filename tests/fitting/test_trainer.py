@@ -662,17 +662,6 @@ def test_the_learning_rate_rises_and_falls() -> None:
     assert factors[-1] == pytest.approx(0.1)
 
 
-def test_at_the_end_all_rates_have_fallen_but_that_of_the_radiances_table(scene: Scene) -> None:
-    trainer = _trainer(scene)
-    trainer.state.step = trainer.steps or 0
-    parts = trainer._update(sampling_at(0.0, SMALL, trainer.needs))  # of a surface that is not yet sharp: at full rate
-    rates = {name: part.step.rate for name, part in zip(trainer.optimiser.parameters, parts, strict=True)}
-    fallen = {name: rate / trainer.optimiser.rates[name] for name, rate in rates.items()}
-    assert fallen.pop("appearance.table") == 1.0
-    assert set(fallen) >= {"surface.grid.table", "surface.hidden", "shader.heads.weight", "exposure.log_gain"}
-    np.testing.assert_allclose(list(fallen.values()), 0.1)
-
-
 def test_only_the_network_of_a_surface_that_is_sharp_remembers_gradients_for_long(scene: Scene) -> None:
     trainer = _trainer(scene)
     sampling = sampling_at(0.5, SMALL, trainer.needs)

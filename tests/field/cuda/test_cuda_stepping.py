@@ -63,9 +63,9 @@ def test_what_is_known_of_rays(device: str, contracted: bool, black: bool) -> No
 
 def test_points_are_even_and_noise_is_normal(device: str) -> None:
     numbers = stepping.new_numbers(torch.device(device))
-    stepping.set_numbers(numbers, 60.0, 0.03, (0.5, 0.125, 0.375, 1.0), (0.5, 0.25, 0.75, 0.875), (1, 2**32 - 1, 3, 4))
-    assert float(numbers.sharpness) == 60.0 and numbers.factors.tolist() == [0.5, 0.125, 0.375, 1.0]
-    assert numbers.beta2.tolist() == [0.5, 0.25, 0.75, 0.875]
+    stepping.set_numbers(numbers, 60.0, 0.03, 0.5, (0.25, 0.75), (0.5, 0.25, 0.75), (1, 2**32 - 1, 3, 4))
+    assert float(numbers.sharpness) == 60.0 and numbers.factors.tolist() == [0.5, 0.125, 0.375]
+    assert numbers.beta2.tolist() == [0.5, 0.25, 0.75]
     assert float(numbers.step) == pytest.approx(0.03) and [x % 2**32 for x in numbers.key.tolist()] == [1, 2**32 - 1, 3, 4]
     points, noise = stepping.random_points(numbers, 3000, 4000, 2.0, 3.0)
     assert float(points.abs().max()) <= 2.0 and float((points.mean(0)).abs().max()) < 0.1

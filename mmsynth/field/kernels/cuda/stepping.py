@@ -16,13 +16,12 @@ from mmsynth.field.kernels.cuda.shared import jit, position, tl, triton
 from mmsynth.field.kernels.parameters import Drawn, Opacities, Rays, View
 
 BLOCK = 128
-KINDS = 4  # of parameters
 _TWO_PI = 2.0 * math.pi
 
 
 class Numbers(NamedTuple):
     """What changes from step to step, on the device: sharpness, step (), float64, see ``Sampling``; factors of learning rates and β₂ of
-    Adam, (``KINDS``,) each: of kinds of parameters; key (4,) int64 of random numbers, two words for each of two draws."""
+    Adam, (3,) each: of all, of the surface's network, of its table; key (4,) int64 of random numbers, two words for each of two draws."""
 
     sharpness: Tensor
     step: Tensor
@@ -32,19 +31,15 @@ class Numbers(NamedTuple):
 
 
 @jit
-def numbers_kernel(  # type: ignore[no-untyped-def]
-    sharpness, step, factors, beta2, key, a, b, rate_0, rate_1, rate_2, rate_3, beta_0, beta_1, beta_2, beta_3, key_0, key_1, key_2, key_3
-):
+def numbers_kernel(sharpness, step, factors, beta2, key, a, b, c, d, e, f, g, h, key_0, key_1, key_2, key_3):  # type: ignore[no-untyped-def]
     tl.store(sharpness, a)
     tl.store(step, b)
-    tl.store(factors, rate_0)
-    tl.store(factors + 1, rate_1)
-    tl.store(factors + 2, rate_2)
-    tl.store(factors + 3, rate_3)
-    tl.store(beta2, beta_0)
-    tl.store(beta2 + 1, beta_1)
-    tl.store(beta2 + 2, beta_2)
-    tl.store(beta2 + 3, beta_3)
+    tl.store(factors, c)
+    tl.store(factors + 1, d)
+    tl.store(factors + 2, e)
+    tl.store(beta2, f)
+    tl.store(beta2 + 1, g)
+    tl.store(beta2 + 2, h)
     tl.store(key, key_0)
     tl.store(key + 1, key_1)
     tl.store(key + 2, key_2)
@@ -53,17 +48,18 @@ def numbers_kernel(  # type: ignore[no-untyped-def]
 
 def new_numbers(device: torch.device) -> Numbers:
     of_sampling = torch.zeros(2, dtype=torch.float64, device=device)
-    of_rates = torch.zeros(2, KINDS, device=device)
+    of_rates = torch.zeros(2, 3, device=device)
     return Numbers(of_sampling[0], of_sampling[1], of_rates[0], of_rates[1], torch.zeros(4, dtype=torch.int64, device=device))
 
 
 def set_numbers(
-    numbers: Numbers, sharpness: float, step: float, factors: Sequence[float], beta2: Sequence[float], key: Sequence[int]
-) -> None:
+    numbers: Numbers, sharpness: float, step: float, factor: float, of_surface: tuple[float, float], beta2: tuple[float, float, float],
+    key: Sequence[int],
+) -> None:  # fmt: skip
     """By arguments of a kernel, which are on their way when this returns: nothing waits, and nothing is overwritten too early."""
     with torch.cuda.device_of(numbers.key):
         signed = (word - (word >> 31 << 32) for word in key)  # the same bits, and one kernel for all of them
-        numbers_kernel[(1,)](*numbers, sharpness, step, *factors, *beta2, *signed)
+        numbers_kernel[(1,)](*numbers, sharpness, step, factor, *(factor * own for own in of_surface), *beta2, *signed)
 
 
 @jit
