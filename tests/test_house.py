@@ -16,7 +16,7 @@ import mmsynth
 
 # from the top down; modules of one room may import each other
 ROOMS = """
-    errors version packaged files toml process threads
+    errors version packaged files toml process threads parallel
     sensors scene prior field.kernels field fitting
     operations.output operations.views operations.conversion operations.simulation operations.dataset operations.mesh operations.evaluation
     operations.export

@@ -28,8 +28,8 @@ from mmsynth.errors import InputError
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import TILE, Field
 from mmsynth.field.kernels import Sampling, reference
-from mmsynth.field.tiles import side_by_side
 from mmsynth.operations.output.progress import Progress
+from mmsynth.parallel import side_by_side
 from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import ray_map
 from mmsynth.threads import kernel_threads

@@ -26,7 +26,7 @@ from mmsynth.field.occupancy import Occupancy
 from mmsynth.field.picture import Rendering, picture_of
 from mmsynth.field.radiance import Shader
 from mmsynth.field.surface import Surface
-from mmsynth.field.tiles import tile_by_tile
+from mmsynth.parallel import tile_by_tile
 from mmsynth.prior.prediction import Prediction, Seen
 from mmsynth.prior.samples import shapes_of
 from mmsynth.scene.scene import Frame, Region, Sensor

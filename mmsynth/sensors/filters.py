@@ -11,20 +11,28 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from mmsynth.parallel import side_by_side
+
 _BAND = 1 << 18  # pixels
 _MOST_CHANNELS = 128  # that OpenCV 5 filters at once
 
 
 def by_bands(function: Callable[..., np.ndarray], images: Sequence[np.ndarray], reach: int, tile: int = 1) -> np.ndarray:
-    """``function`` of pictures (H, W, ...), each row of which depends on ``reach`` rows above and below: by bands of rows, so that what it
-    computes of a full-size picture needs little memory. Bands begin at multiples of ``tile`` rows."""
+    """``function`` of pictures (H, W, ...), each row of which depends on ``reach`` rows above and below: by bands of rows, side by side,
+    so that what it computes of a full-size picture needs little memory. Bands begin at multiples of ``tile`` rows."""
     height, width = images[0].shape[:2]
     step, margin = (-(-rows // tile) * tile for rows in (max(1, _BAND // width), reach))
-    parts = []
-    for top in range(0, height, step):
+
+    def of_band(top: int) -> np.ndarray:
         first, last = max(top - margin, 0), min(top + step + margin, height)
-        parts.append(function(*(image[first:last] for image in images))[top - first : top - first + step])
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return function(*(image[first:last] for image in images))[top - first : top - first + step]
+
+    found: np.ndarray | None = None
+    for top, part in side_by_side(of_band, range(0, height, step)):
+        found = np.empty((height, *part.shape[1:]), part.dtype) if found is None else found
+        found[top : top + step] = part
+    assert found is not None, "a picture without rows"
+    return found
 
 
 def box_mean(image: np.ndarray, size: int) -> np.ndarray:

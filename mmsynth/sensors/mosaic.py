@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_BAND = 1 << 18  # pixels that are demosaicked together
+from mmsynth.sensors.filters import by_bands
+
 _LEAST_NORM = 1e-6  # weight of the photosites around one; below it there are none
 BAYER = {  # channels 0, 1, 2 = red, green, blue, and OpenCV's name of the pattern: that of the pixels (1, 1) and (1, 2)
     ((0, 1), (1, 2)): cv2.COLOR_BayerBG2RGB_EA,
@@ -102,23 +103,41 @@ def channels_of(frame: np.ndarray, pattern: np.ndarray | None) -> np.ndarray:
     """``demosaic`` of a frame as files have it, by OpenCV's filters: (H, W) → (H, W, C); without a pattern it has all channels already."""
     if pattern is None:
         return frame
-    # by bands of rows and what of their neighbours they take: all of a full-size frame takes ten times the memory of what it gives
-    height, width = frame.shape
-    rows, reach = pattern.shape[0], max(pattern.shape)
-    step, margin = -(-max(_BAND // width, 4 * reach) // rows) * rows, -(-reach // rows) * rows  # whole tiles: bands keep the phase
-    tent, channels = _tent(reach), np.arange(int(pattern.max()) + 1)
-    blur = lambda images: cv2.sepFilter2D(images, -1, tent, tent, borderType=cv2.BORDER_CONSTANT).reshape(images.shape)
-    out = np.empty((height, width, len(channels)), frame.dtype)
-    for top in range(0, height, step):
-        first, last = max(top - margin, 0), min(top + step + margin, height)
-        present = channel_map(pattern, last - first, width)[..., None] == channels
-        own = np.where(present, frame[first:last, :, None], frame.dtype.type(0))
-        norm = blur(present.astype(frame.dtype))
+    rows, reach, channels = pattern.shape[0], max(pattern.shape), np.arange(int(pattern.max()) + 1)
+
+    def of_band(band: np.ndarray) -> np.ndarray:
+        present = channel_map(pattern, *band.shape)[..., None] == channels
+        own = np.where(present, band[..., None], band.dtype.type(0))
+        norm = _blurred(present.astype(band.dtype), reach)
         with np.errstate(invalid="ignore"):  # 0 / 0: never measured
             mean = own.sum((0, 1)) / present.sum((0, 1))
-        filled = np.where(norm > _LEAST_NORM, blur(own) / np.maximum(norm, _LEAST_NORM), mean)
-        out[top : top + step] = np.where(present, own, filled)[top - first : top - first + step]
-    return out
+        filled = np.where(norm > _LEAST_NORM, _blurred(own, reach) / np.maximum(norm, _LEAST_NORM), mean)
+        return np.where(present, own, filled).astype(band.dtype, copy=False)
+
+    # all of a full-size frame at once takes ten times the memory of what it gives
+    return by_bands(of_band, (frame,), reach, rows)
+
+
+def grey_of(frame: np.ndarray, pattern: np.ndarray | None) -> np.ndarray:
+    """(H, W), the mean of all channels, of a frame as files have it: a tent-weighted mean of the photosites around, in which all channels
+    weigh alike; the mean of what ``channels_of`` gives where each channel is measured once in a square tile, within the frame."""
+    if pattern is None:
+        return np.asarray(frame.mean(-1))
+    share = (1.0 / np.bincount(pattern.ravel()))[pattern].astype(frame.dtype)
+    rows, reach = pattern.shape[0], max(pattern.shape)
+
+    def of_band(band: np.ndarray) -> np.ndarray:
+        height, width = band.shape
+        weight = np.tile(share, (-(-height // rows), -(-width // share.shape[1])))[:height, :width]
+        return np.asarray(_blurred(weight * band, reach) / _blurred(weight, reach))
+
+    return by_bands(of_band, (frame,), reach, rows)
+
+
+def _blurred(images: np.ndarray, size: int) -> np.ndarray:
+    """(H, W) or (H, W, C), times the weights of ``_tent`` along both axes; nothing beyond the border."""
+    tent = _tent(size)
+    return cv2.sepFilter2D(images, -1, tent, tent, borderType=cv2.BORDER_CONSTANT).reshape(images.shape)
 
 
 def is_bayer(pattern: np.ndarray) -> bool:

@@ -8,8 +8,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mmsynth.sensors import mosaic as mosaics
-from mmsynth.sensors.mosaic import BAYER, channel_map, channels_of, crop_pattern, demosaic, demosaic_edge_aware, mosaic, mosaic_mask
+from mmsynth.sensors import filters
+from mmsynth.sensors.mosaic import (
+    BAYER,
+    channel_map,
+    channels_of,
+    crop_pattern,
+    demosaic,
+    demosaic_edge_aware,
+    grey_of,
+    mosaic,
+    mosaic_mask,
+    photosites_of,
+)
 
 RGGB = np.array([[0, 1], [1, 2]])
 POL = np.array([[2, 1], [3, 0]])
@@ -131,8 +142,25 @@ def test_gradients(which: int) -> None:
 def test_a_frame_demosaicked_by_bands_is_the_frame_demosaicked(pattern: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
     frame, tile = np.random.default_rng(0).random((47, 13)), np.array(pattern)
     whole = demosaic(torch.from_numpy(frame), tile).movedim(0, -1).numpy()
-    monkeypatch.setattr(mosaics, "_BAND", 1)
+    monkeypatch.setattr(filters, "_BAND", 1)
     np.testing.assert_allclose(channels_of(frame, tile), whole, atol=1e-14)
+
+
+@pytest.mark.parametrize("pattern", [[[0, 1], [1, 2]], [[4, 5, 6], [2, 1, 0], [3, 8, 7]], [[0, 1]], [[0, 1, 2, 2], [3, 1, 0, 3]]])
+def test_grey_of_a_mosaic(pattern: list[list[int]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """All channels weigh alike, whatever photosites they have: exact on what changes evenly, and a grey picture stays as it is."""
+    tile = np.array(pattern)
+    v, u = np.mgrid[:47, :13]
+    picture = np.stack([0.1 + 0.2 * c + (0.01 + 0.003 * c) * u + (0.02 - 0.004 * c) * v for c in range(int(tile.max()) + 1)], -1)
+    monkeypatch.setattr(filters, "_BAND", 1)
+    grey = grey_of(photosites_of(picture, tile), tile)
+    inside = (slice(max(tile.shape) - 1, 1 - max(tile.shape)),) * 2
+    np.testing.assert_allclose(grey[inside], picture.mean(-1)[inside], atol=1e-12)
+    np.testing.assert_allclose(grey_of(np.full((47, 13), 0.3), tile), 0.3, atol=1e-14)
+    frame = np.random.default_rng(0).random((47, 13))
+    if tile.size == len(np.unique(tile)) and tile.shape[0] == tile.shape[1]:
+        np.testing.assert_allclose(grey_of(frame, tile)[inside], channels_of(frame, tile).mean(-1)[inside], atol=1e-14)
+    np.testing.assert_array_equal(grey_of(picture, None), picture.mean(-1))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 7), (4, 2)])

@@ -22,7 +22,7 @@ from mmsynth.operations.conversion.warping import warped
 from mmsynth.operations.conversion.windows import opened
 from mmsynth.scene.scene import Frame, PosedCamera, Scene
 from mmsynth.sensors.camera import resized, surface_points
-from mmsynth.sensors.mosaic import channels_of
+from mmsynth.sensors.mosaic import grey_of
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -95,9 +95,9 @@ def _pair(field: Field, one: Frame, other: Frame) -> np.ndarray:
         view = PosedCamera(camera, view.camera_to_world)
         seen = field.render(view.camera, view.camera_to_world, [], geometry=True)
         sensor = field.sensors[frame.sensor]
-        values = channels_of(raw, sensor.mosaic)
+        clipped = (raw >= sensor.saturation).astype(np.float32)
         small = lambda a, c=camera: cv2.resize(a.astype(np.float32), (c.width, c.height), interpolation=cv2.INTER_AREA)
-        bright, value = small((values >= sensor.saturation).any(-1)), small(values.mean(-1))
+        bright, value = (small(grey_of(a, sensor.mosaic)) for a in (clipped, raw))
         points = surface_points(camera, view.camera_to_world, seen.depth_ray)
         away = view.camera_to_world[:3, 3] - points
         distance = np.linalg.norm(away, axis=-1)

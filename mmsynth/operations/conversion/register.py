@@ -22,9 +22,9 @@ from mmsynth.operations.output.progress import Progress
 from mmsynth.scene.capture.boards import Corner, board_corners, markers_in
 from mmsynth.scene.images import load_frame
 from mmsynth.scene.motion import motion_to_matrix
-from mmsynth.scene.scene import Scene, Sensor
+from mmsynth.scene.scene import Scene
 from mmsynth.sensors.camera import Camera, project, ray_map, unproject
-from mmsynth.sensors.mosaic import channel_map, channels_of
+from mmsynth.sensors.mosaic import channel_map, grey_of
 
 if TYPE_CHECKING:
     from mmsynth.field.field import Field
@@ -83,7 +83,7 @@ def landmarks(field: Field, scene: Scene, source: str, *, progress: Progress | N
     frames = [replace(frame, camera_to_world=field.pose_of(frame)) for frame in scene.frames_of(source, scene.split.train)]
     out = []
     for done, frame in enumerate(frames, 1):
-        points, descriptors = _features(_grey(load_frame(sensor, frame)[0], sensor))
+        points, descriptors = _features(grey_of(load_frame(sensor, frame)[0], sensor.mosaic))
         pose = frame.camera_to_world
         rays, valid = unproject(points, frame.camera)
         depth = field.cast(rays, pose, [], False)["depth"].astype(np.float64) * field.region.radius if len(rays) else np.zeros(0)
@@ -91,7 +91,7 @@ def landmarks(field: Field, scene: Scene, source: str, *, progress: Progress | N
         out.append(Features((pose[:3, 3] + rays @ pose[:3, :3].T * depth[:, None])[valid], descriptors[valid]))
         if progress is not None:
             progress(done, len(frames))
-    return Landmarks(out, board_corners(frames, lambda frame: _grey(load_frame(sensor, frame)[0], sensor)))
+    return Landmarks(out, board_corners(frames, lambda frame: grey_of(load_frame(sensor, frame)[0], sensor.mosaic)))
 
 
 def register(field: Field, known: Landmarks, raw: np.ndarray, camera: Camera, source: str, *, name: str = "frame") -> Registered:
@@ -103,7 +103,7 @@ def register(field: Field, known: Landmarks, raw: np.ndarray, camera: Camera, so
         InputError: too few features agree with the field, the frame does not look as the field does from there, or the pose is not certain
             to a pixel; with the figures.
     """
-    grey = _grey(raw, field.sensors[source])
+    grey = grey_of(raw, field.sensors[source].mosaic)
     points, descriptors = _features(grey)
     guesses = _by_markers(markers_in(grey), camera, known.markers) + _by_features(points, descriptors, camera, known.features)
     inliers = max((count for _, count in guesses), default=0)
@@ -127,11 +127,6 @@ def register(field: Field, known: Landmarks, raw: np.ndarray, camera: Camera, so
     if not found.sd_px < WORST_SD_PX:
         raise InputError(f"{name}: its pose is uncertain by {found.sd_px:.2g} pixels, expected less than {WORST_SD_PX:g}.")
     return found
-
-
-def _grey(raw: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """(H, W), linear."""
-    return np.asarray(channels_of(raw, sensor.mosaic).mean(-1))
 
 
 def _by_markers(seen: dict[Corner, np.ndarray], camera: Camera, known: dict[Corner, np.ndarray]) -> list[tuple[np.ndarray, int]]:

@@ -9,15 +9,15 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from mmsynth.field import tiles
+from mmsynth import parallel
 from mmsynth.field.kernels.cpu import stores
-from mmsynth.field.tiles import side_by_side
+from mmsynth.parallel import side_by_side
 from mmsynth.threads import kernel_threads
 
 
 @pytest.fixture
 def threads(monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(tiles, "kernel_threads", lambda: 3)
+    monkeypatch.setattr(parallel, "kernel_threads", lambda: 3)
     return 3
 
 
@@ -32,7 +32,7 @@ def test_tiles_come_in_their_order_and_are_made_as_they_are_needed(threads: int)
     gate = threading.Event()
     found = side_by_side(lambda i: (gate.wait() if i == 0 else None, i * i)[1], numbers())
     threading.Timer(0.05, gate.set).start()  # the first is the last to be ready
-    assert next(found) == (0, 0) and len(made) == tiles._AHEAD * threads
+    assert next(found) == (0, 0) and len(made) == parallel._AHEAD * threads
     assert list(found) == [(i, i * i) for i in range(1, 100)]
 
 
@@ -70,7 +70,7 @@ def test_one_that_fails_ends_it_and_what_has_not_begun_is_not_worked_on(threads:
 
     with pytest.raises(ValueError, match="tile 2"):
         list(side_by_side(work, range(1000)))
-    assert len(done) <= 3 + tiles._AHEAD * threads
+    assert len(done) <= 3 + parallel._AHEAD * threads
     found = side_by_side(lambda i: i, range(1000))
     assert next(found) == (0, 0)
     found.close()  # no more are wanted
