@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ import OpenEXR
 from mmsynth.errors import InputError
 from mmsynth.files import write_atomic
 from mmsynth.scene.images import first_line
+
+_PARTS, _PART, _WORTH = 32, 32768, 0.8  # of an array that is tried: how many, bytes of each; what it must come to
 
 
 def to_uint16(image: np.ndarray) -> np.ndarray:
@@ -91,8 +95,25 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mappin
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays as compressed npz; ``read_image`` reads the one called ``data``."""
-    write_atomic(Path(path), lambda temporary: np.savez_compressed(temporary, allow_pickle=False, **dict(arrays)))
+    """Write named arrays as npz, compressed where that saves enough (``_shrinks``); ``read_image`` reads the one called ``data``."""
+
+    def write(temporary: Path) -> None:
+        with zipfile.ZipFile(temporary, "w") as archive:
+            for name, array in arrays.items():
+                entry = zipfile.ZipInfo(f"{name}.npy")
+                entry.compress_type = zipfile.ZIP_DEFLATED if _shrinks(array) else zipfile.ZIP_STORED
+                with archive.open(entry, "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
+
+    write_atomic(Path(path), write)
+
+
+def _shrinks(array: np.ndarray) -> bool:
+    """Whether a few parts of an array lose a fifth by compression: light and normals of full-size pictures lose a tenth, and take as long
+    to compress as to render; masks, and pictures of an object before nothing, lose most."""
+    parts = np.array_split(np.ravel(array), _PARTS)
+    sample = b"".join(np.ascontiguousarray(part[: _PART // array.itemsize]).tobytes() for part in parts)
+    return len(zlib.compress(sample)) < _WORTH * len(sample)
 
 
 def write_tiff16(path: Path, image: np.ndarray) -> None:

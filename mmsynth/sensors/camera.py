@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from mmsynth.errors import InputError
+from mmsynth.parallel import side_by_side
 from mmsynth.sensors import lenses
 
 Lens = Literal["brown_conrady", "kannala_brandt"]
@@ -190,10 +191,13 @@ def ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def _ray_map(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     directions, valid = np.empty((camera.height, camera.width, 3)), np.empty((camera.height, camera.width), bool)
     rows = max(1, _SMALL // camera.width)  # at a time: the inverse of a lens takes ten times the memory of what it gives
-    for top in range(0, camera.height, rows):
-        band = slice(top, min(top + rows, camera.height))
-        v, u = np.mgrid[band, 0 : camera.width]
-        directions[band], valid[band] = unproject(np.stack([u, v], -1).astype(np.float64), camera)
+
+    def of_band(top: int) -> tuple[np.ndarray, np.ndarray]:
+        v, u = np.mgrid[top : min(top + rows, camera.height), 0 : camera.width]
+        return unproject(np.stack([u, v], -1).astype(np.float64), camera)
+
+    for top, found in side_by_side(of_band, range(0, camera.height, rows)):
+        directions[top : top + rows], valid[top : top + rows] = found
     directions.setflags(write=False)
     valid.setflags(write=False)
     return directions, valid
@@ -215,8 +219,10 @@ def rays_of_pixels(camera: Camera, begin: int, end: int, device: torch.device | 
 
 def surface_points(camera: Camera, camera_to_world: np.ndarray, depth_ray: np.ndarray) -> np.ndarray:
     """Points that pixels see: depth along the ray (H, W) → (H, W, 3) float64, world, NaN where the depth is (kornia's is for pinholes)."""
-    directions = ray_map(camera)[0] @ camera_to_world[:3, :3].T
-    return camera_to_world[:3, 3] + directions * depth_ray[..., None].astype(np.float64)
+    points = ray_map(camera)[0].reshape(-1, 3) @ camera_to_world[:3, :3].T  # of rows of pixels numpy makes many small products
+    points *= depth_ray.reshape(-1, 1)
+    points += camera_to_world[:3, 3]
+    return np.asarray(points.reshape(*depth_ray.shape, 3))
 
 
 def round_trip_error(camera: Camera, pixels: np.ndarray) -> tuple[float, float]:

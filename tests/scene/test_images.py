@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import zipfile
 from pathlib import Path
 
 import cv2
@@ -51,6 +52,34 @@ def test_npz_and_npy_are_not_scaled_when_float(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", (MANY * 65535).astype(np.uint16))
     np.testing.assert_array_equal(read_image(tmp_path / "a.npz"), MANY * 3)
     np.testing.assert_allclose(read_image(tmp_path / "a.npy"), MANY, atol=2 * HALF_STEP)
+
+
+def test_an_npz_compresses_what_shrinks(tmp_path: Path) -> None:
+    """Noise is stored as it is, a picture before nothing is not; all of them come back as they were."""
+    noise, alone = np.random.default_rng(2).random((300, 400)).astype(np.float32), np.full((300, 400, 3), np.nan, np.float32)
+    alone[100:150, 100:300] = noise[:50, :200, None]
+    arrays = {
+        "data": noise,
+        "alone": alone,
+        "turned": noise.T,
+        "seen": np.isfinite(alone),
+        "names": np.array(["a", "b"]),
+        "none": noise[:0],
+    }
+    write_npz(tmp_path / "a.npz", arrays)
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+    assert entries["data"].compress_size == entries["data"].file_size
+    assert all(entries[name].compress_size < 0.5 * entries[name].file_size for name in ("alone", "seen"))
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as found:
+        assert found.files == list(arrays)
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(found[name], array)
+    damaged = bytearray((tmp_path / "a.npz").read_bytes())
+    damaged[1000] ^= 1  # of what is stored
+    (tmp_path / "a.npz").write_bytes(damaged)
+    with pytest.raises(InputError, match=r"a\.npz"):
+        read_image(tmp_path / "a.npz")
 
 
 def test_full_scale_is_exactly_one(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ import numpy as np
 from mmsynth.errors import InputError
 from mmsynth.operations.output.progress import Progress
 from mmsynth.operations.views.visibility import hidden, inside, towards
+from mmsynth.parallel import side_by_side
 from mmsynth.scene.scene import PosedCamera, Scene
 from mmsynth.sensors.camera import Camera, project, resized, surface_points, unproject
 
@@ -189,7 +190,8 @@ def _coverage(rays: TrainingRays, view: PosedCamera, focal: float, depth_ray: np
     normals = towards(normal[hit], points, centre)
     step = max(1, _PAIRS // len(rays.poses))
     parts = [slice(start, start + step) for start in range(0, len(points), step)]
-    out[hit] = np.concatenate([_best(rays, points[p], normals[p], centre, focal) for p in parts]) if parts else 0.0
+    best = [found for _, found in side_by_side(lambda part: _best(rays, points[part], normals[part], centre, focal), parts)]
+    out[hit] = np.concatenate(best) if best else 0.0
     return out
 
 
@@ -203,18 +205,19 @@ def _best(rays: TrainingRays, points: np.ndarray, normals: np.ndarray, centre: n
     for start in range(0, len(points), step):
         block = slice(start, start + step)
         could[block] = _closeness(rays, points[block] - centre, normals[block], centre, focal)
-    order = np.argsort(-could, axis=1)
     best = np.zeros(len(points))
-    waiting = np.arange(len(points))
+    waiting, order = np.arange(len(points)), could.argmax(1)[:, None]  # of all frames only where the first does not see the point
     start, size = 0, 1
-    while len(waiting) and start < order.shape[1]:
-        frames = order[waiting, start : start + size]
+    while len(waiting) and start < could.shape[1]:
+        frames = order[:, start : start + size]
         worth = could[waiting[:, None], frames]
         at, rank = np.nonzero(worth > 0)
         seen = np.zeros(worth.shape, bool)
         seen[at, rank] = _sees(rays, frames[at, rank], points[waiting[at]])
         best[waiting] = np.where(seen, worth, 0.0).max(1)
-        waiting = waiting[~seen.any(1) & (worth[:, -1] > 0)]
+        more = ~seen.any(1) & (worth[:, -1] > 0)
+        waiting = waiting[more]
+        order = np.argsort(-could[waiting], axis=1, kind="stable") if start == 0 else order[more]  # the first is that of argmax
         start, size = start + size, 4 * size
     return best
 

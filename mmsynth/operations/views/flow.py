@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from mmsynth.field.picture import bands
 from mmsynth.operations.views.visibility import hidden, inside, towards
+from mmsynth.parallel import side_by_side
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import project, surface_points
 
@@ -26,16 +28,20 @@ def optical_flow(
         something is nearer to b there, by more than ``visibility.SAME_SURFACE`` of the point's distance. False without a surface.
     """
     points = surface_points(a.camera, a.camera_to_world, depth_ray_a)
-    hit = np.isfinite(depth_ray_a)
     centre_a, centre_b = a.camera_to_world[:3, 3], b.camera_to_world[:3, 3]
-    in_b = (points[hit] - centre_b) @ b.camera_to_world[:3, :3]
-    pixels = project(in_b, b.camera)
-    seen = inside(pixels, b.camera)
-    faces = np.einsum("ni,ni->n", towards(normal_a[hit], points[hit], centre_a), centre_b - points[hit]) > 0
-    seen &= faces
-    seen[seen] = ~hidden(np.linalg.norm(in_b[seen], axis=1), pixels[seen], depth_ray_b)
-    flow = np.full((*hit.shape, 2), np.nan, np.float32)
-    flow[hit] = pixels - np.argwhere(hit)[:, ::-1]
-    occluded = np.zeros(hit.shape, bool)
-    occluded[hit] = ~seen
+    flow, occluded = np.full((*depth_ray_a.shape, 2), np.nan, np.float32), np.zeros(depth_ray_a.shape, bool)
+
+    def of_rows(rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of some rows: where there is a surface, what it moves by, and whether b sees it."""
+        hit = np.isfinite(depth_ray_a[rows])
+        there = points[rows][hit]
+        in_b = (there - centre_b) @ b.camera_to_world[:3, :3]
+        pixels = project(in_b, b.camera)
+        seen = inside(pixels, b.camera)
+        seen &= np.einsum("ni,ni->n", towards(normal_a[rows][hit], there, centre_a), centre_b - there) > 0
+        seen[seen] = ~hidden(np.linalg.norm(in_b[seen], axis=1), pixels[seen], depth_ray_b)
+        return hit, pixels - (np.argwhere(hit)[:, ::-1] + [0, rows.start]), seen
+
+    for rows, (hit, moved, seen) in side_by_side(of_rows, bands(depth_ray_a.shape)):
+        flow[rows][hit], occluded[rows][hit] = moved, ~seen
     return flow, occluded

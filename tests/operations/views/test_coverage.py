@@ -13,6 +13,7 @@ from analytic import MONO, RGB, AnalyticField, Distance, meets_ball, sphere
 from conftest import look_at, ring
 
 from mmsynth.errors import InputError
+from mmsynth.operations.views import coverage as coverages
 from mmsynth.operations.views.coverage import (
     TrainingRays,
     coverage,
@@ -112,8 +113,12 @@ def test_resolution(distance: float, zoom: float, expected: float) -> None:
     assert out[45, 60] == pytest.approx(expected, rel=1e-6)
 
 
-def test_best_of_many_is_the_largest_of_each() -> None:
-    field = field_of(sphere())
+@pytest.mark.parametrize("balls", [sphere(), lambda p: np.minimum(sphere(0.6)(p), sphere(0.2, np.array([0.4, 0.8, 0.4]))(p))], ids="12")
+@pytest.mark.parametrize("pairs", [4_000_000, 20_000])
+def test_best_of_many_is_the_largest_of_each(balls: Distance, pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a ball hides points from the frames that would see them best, and where points are judged by parts, side by side."""
+    monkeypatch.setattr(coverages, "_PAIRS", pairs)
+    field = field_of(balls)
     poses = [look_at(p) for p in np.random.default_rng(1).normal(size=(20, 3)) * 3 if np.linalg.norm(p) > 1.5]
     view = look_at((1.0, 2.0, 1.0))
     each = [covered(field, rays_of(field, pose), view)[0] for pose in poses]

@@ -9,6 +9,7 @@ from analytic import RGB, AnalyticField, meets_ball, sphere
 from conftest import look_at
 from scipy.spatial.transform import Rotation
 
+from mmsynth.field import picture
 from mmsynth.operations.views.flow import optical_flow
 from mmsynth.scene.scene import PosedCamera
 from mmsynth.sensors.camera import Camera, ray_map, surface_points
@@ -100,7 +101,7 @@ def test_lenses_against_opencv(camera_a: Camera, camera_b: Camera) -> None:
     np.testing.assert_allclose(flow, expected - grid(camera_a), atol=1e-4)
 
 
-def test_hidden_by_a_nearer_ball() -> None:
+def test_hidden_by_a_nearer_ball(monkeypatch: pytest.MonkeyPatch) -> None:
     """A small ball before a big one, from two sides; judged with a ball a little larger and a little smaller than the one there."""
     camera = Camera(160, 120, 170.0, 170.0, 79.5, 59.5)
     big, small, between = 0.6, 0.2, np.array([1.2, 0.0, 0.0])
@@ -118,6 +119,10 @@ def test_hidden_by_a_nearer_ball() -> None:
     covered = on_big & (facing > 1e-3) & meets_ball(points, pose_b[:3, 3], between, 0.95 * small)
     behind = on_big & (facing < -1e-3)
     assert min(clear.sum(), covered.sum(), behind.sum()) > 200
+    monkeypatch.setattr(picture, "_BAND", 160 * 7)  # rows side by side, the last of them cut off
+    again = optical_flow(PosedCamera(camera, pose_a), a.depth_ray, a.normal, PosedCamera(camera, pose_b), b.depth_ray)
+    np.testing.assert_array_equal(again[0], flow)
+    np.testing.assert_array_equal(again[1], occluded)
     assert not occluded[clear].any() and occluded[covered].all() and occluded[behind].all()
 
 
