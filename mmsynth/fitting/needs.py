@@ -44,6 +44,7 @@ class Needs:
         black_background: whether black pixels say that nothing is there.
         sparse: modalities that learn their colours from the geometry and appearance of the others: with so few pixels that they would
             spoil what others know better, or without the masks of the object that others have.
+        smooth: whether normals of neighbouring rays are pulled together, outside of the region.
         share: of the rays that each modality gets, relative to a plentiful one.
         choices: by name; what is decided later is in ``Trainer.choices``.
     """
@@ -54,6 +55,7 @@ class Needs:
     sharpness_until: float
     black_background: bool
     sparse: tuple[str, ...]
+    smooth: bool
     share: dict[str, float]
     choices: dict[str, Choice[Any]]
 
@@ -107,11 +109,11 @@ def expected_rays(recipe: Recipe, steps: int | None, budget: float | None, on_gp
     return steps * (max(samples, SAMPLES_ON_GPU) if on_gpu else samples) / _SAMPLES_PER_RAY
 
 
-def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, rays_to_come: float) -> Needs:
+def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, rays_to_come: float, on_gpu: bool = False) -> Needs:
     """Look at the cameras and at some random pixels of each modality.
 
     Args:
-        rays_to_come: about how many rays the fit will see (``expected_rays``).
+        rays_to_come: about how many rays the fit will see (``expected_rays``). on_gpu: see there.
     """
     pixels = sum(m.pixels for m in measurements.values())
     seen = _look_outside(measurements, np.random.default_rng((seed, 7)))
@@ -122,6 +124,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
     spheres = _initial_spheres(facts, background.value)
     share = _ray_shares(facts)
     rows = _table_rows(facts)
+    smooth = _smooth(facts, background.value, on_gpu)
     choices: dict[str, Choice[Any]] = {
         "masks": _masks(facts),
         "background": background,
@@ -129,6 +132,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
         "resolution": resolution,
         "initial_sphere": spheres,
         "sparse": share,
+        "smooth": smooth,
         "tensor_head": _tensor_head(facts),
     }
     if recipe.schedule.tables_at == 0:  # else the last word on them is said when the cells at the surface are counted
@@ -158,6 +162,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
         sharpness_until=recipe.schedule.sharpness_until * _sooner(rays_to_come),
         black_background=not background.value and facts.outside >= _PAST,
         sparse=tuple(n for n, s in share.value.items() if s < 1.0 or n in facts.unmasked),
+        smooth=smooth.value,
         share=share.value,
         choices=choices,
     )
@@ -253,6 +258,19 @@ def _ray_shares(f: _Facts) -> Choice[dict[str, float]]:
     sparse = ", ".join(f"{n} {len(f.measurements[n].origins)} frames" for n, s in share.items() if s < 1.0)
     why = f"on: {sparse}: learned from the geometry of the others" if sparse else "off: all modalities have enough pixels"
     return Choice(share, why, bool(sparse))
+
+
+def _smooth(f: _Facts, background: bool, on_gpu: bool) -> Choice[bool]:
+    """Do few views see what lies outside the region?"""
+    views = len({frame.view for frame in f.scene.frames if frame.sensor in f.measurements and frame.view in f.scene.split.train})
+    seen, loss = f"{views} training views", f.recipe.loss
+    if not background:
+        return switch(False, "no surfaces outside of the region are modelled")
+    if views > loss.smooth_views or loss.smooth_weight == 0:
+        return switch(False, seen)
+    if on_gpu:
+        return switch(False, f"{seen} are few, but steps on a GPU do not pull normals together yet")
+    return switch(True, f"{seen}: outside of the region normals of neighbouring rays are pulled together")
 
 
 def _tensor_head(f: _Facts) -> Choice[bool]:

@@ -152,6 +152,7 @@ class ScheduleRecipe(_Section):
     light_at: float = _key(0.3, "Progress at which lamps are looked for, and from which surfaces mirror them [progress].", ge=0, le=1)
     light_until: float = _key(0.45, "Progress at which residuals decide whether that is needed [progress].", ge=0, le=1)
     decide_at: float = _key(0.6, "Progress at which residuals decide on view dependence and exposure [progress].", ge=0, le=1)
+    smooth_until: float = _key(0.7, "Progress up to which few views have normals pulled together [progress].", ge=0, le=1)
     learning_rate_grid: float = _key(2e-2, "Adam's rate of the hash tables [1/step].", gt=0)
     learning_rate_network: float = _key(4e-3, "Adam's rate of the networks [1/step].", gt=0)
     learning_rate_light: float = _key(8e-3, "Adam's rate of the lamps and of how surfaces mirror them [1/step].", gt=0)
@@ -196,6 +197,12 @@ class LossRecipe(_Section):
         le=1,
     )
     eikonal_points: int = _key(1024, "Points of a step that are asked for it [points].", ge=8)
+    smooth_weight: float = _key(
+        0.01,
+        "Weight of the pull between normals of neighbouring rays outside of the region, where views are few [1]; 0: none.",
+        ge=0,
+    )
+    smooth_views: int = _key(12, "Training views up to which they are few [views].", ge=0)
     background_opacity_weight: float = _key(1.0, "Weight of opacity on black pixels of a scene whose background is black [1].", ge=0)
     alpha_weight: float = _key(
         0.5, "Weight of the squared difference of opacity and alpha, where images have it or masks of an object say it [1].", ge=0

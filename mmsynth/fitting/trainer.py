@@ -38,9 +38,11 @@ from mmsynth.fitting.schedule import (
     light_looks,
     samples_of_step,
     sampling_at,
+    smooth_weight,
     surface_beta2,
     surface_rates,
 )
+from mmsynth.fitting.smoothness import pull_together
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, eikonal_points, opacities
@@ -78,7 +80,7 @@ class Trainer:
         fused = self.device.type == "cuda" and kernels.fused_on_gpu()
         rays_to_come = expected_rays(recipe, steps, budget, fused)
         self.measurements: Measurements = load_measurements(scene, rays_to_come=rays_to_come, device=self.device, on_load=on_load)
-        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come, fused)
         sensors = {n: m.sensor for n, m in self.measurements.items()}
         radiance_scale = {n: m.radiance_scale for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
@@ -162,6 +164,9 @@ class Trainer:
             asked = self._to_draw(state.step, state.rays)
             drawn = drawn_step(self.field, self.measurements, asked, [kernels.draw(*drawing) for drawing in asked.drawings])
         self._prepare(sampling, drawn.generator)
+        weight = smooth_weight(state.step, done, self.recipe) if self.needs.smooth else 0.0
+        if weight > 0:
+            pull_together(self.field, drawn.batch.origins, drawn.batch.directions, sampling, weight, (self.seed, 4, state.step))
         asked, arranged = self.arranged or self._arrange(drawn, state.step)
         rays, state.rays, errors = state.rays, state.rays_after, dict[str, float]()
 
