@@ -1,4 +1,4 @@
-"""Work on many rays by tiles: on a CPU side by side, each tile on a core of its own.
+"""Work side by side: tiles of rays, or parts of a picture, each on a core of its own.
 
 A kernel that all cores share is followed by operations that one core does, and by all that Python does between them; tiles side by side
 leave no core without work.

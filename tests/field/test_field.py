@@ -15,9 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize, softplus
 
+from mmsynth import parallel
 from mmsynth.errors import InputError
 from mmsynth.field import field as fields
-from mmsynth.field import kernels, rendering, tiles
+from mmsynth.field import kernels, rendering
 from mmsynth.field.design import Design
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import intensity, radiance
@@ -123,7 +124,7 @@ def test_pictures_are_the_same_to_the_bit_by_tiles_side_by_side(background: bool
     monkeypatch.setattr(fields, "TILE", 128)
     seen = []
     for threads in (1, 3, 3):
-        monkeypatch.setattr(tiles, "kernel_threads", lambda threads=threads: threads)
+        monkeypatch.setattr(parallel, "kernel_threads", lambda threads=threads: threads)
         seen.append(field.render(camera, pose))
     for other in seen[1:]:
         for part in ("depth_z", "opacity", "normal", "valid"):
