@@ -123,12 +123,11 @@ def grey_of(frame: np.ndarray, pattern: np.ndarray | None) -> np.ndarray:
     weigh alike; the mean of what ``channels_of`` gives where each channel is measured once in a square tile, within the frame."""
     if pattern is None:
         return np.asarray(frame.mean(-1))
-    share = (1.0 / np.bincount(pattern.ravel()))[pattern].astype(frame.dtype)
+    share = (1.0 / np.bincount(pattern.ravel())).astype(frame.dtype)
     rows, reach = pattern.shape[0], max(pattern.shape)
 
     def of_band(band: np.ndarray) -> np.ndarray:
-        height, width = band.shape
-        weight = np.tile(share, (-(-height // rows), -(-width // share.shape[1])))[:height, :width]
+        weight = share[channel_map(pattern, *band.shape)]
         return np.asarray(_blurred(weight * band, reach) / _blurred(weight, reach))
 
     return by_bands(of_band, (frame,), reach, rows)
