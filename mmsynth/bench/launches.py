@@ -106,14 +106,15 @@ def device_step(trainer: Trainer, lamps: int) -> DeviceStep:
     )  # fmt: skip
 
 
-def step_launches(step: DeviceStep, decided: bool, outside: bool = False) -> Counted:
+def step_launches(step: DeviceStep, decided: bool, outside: bool = False, pairs: int = 0) -> Counted:
     """What a step launches, from the second of its stage on.
 
     Args:
-        decided: whether exposures have factors and light comes from far away. outside: whether rays are drawn where nothing is.
+        decided: whether exposures have factors and light comes from far away. outside: whether rays are drawn where nothing is. pairs: of
+            neighbouring normals that are pulled together.
     """
     sampling = sampling_at(0.7, step.recipe, step.needs)
-    stage = step.stage(sampling, 500, decided, gains=decided, early=False, outside=4)
+    stage = step.stage(sampling, 500, decided, gains=decided, early=False, pairs=pairs, outside=4)
     if outside:  # drawn from the pixels that are learned from: what is launched is the same
         step.measurements = replace(step.measurements, empty=step.measurements.chosen)
         stage = replace(stage, outside=tuple(1 for _ in stage.rays))

@@ -105,7 +105,8 @@ def run_steps() -> None:
         step = kernels.Step(
             *surface.at(1), appearance.at(1), Occupancy(4).states, weights, kernels.no_light("cpu"), none, rays,
             kernels.View(index, index == 0), measured, kernels.Gains(none, index), kernels.Opacities(none, none, none, none, 0.05),
-            kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Sampling(20.0, 0.1, 1, 1),
+            kernels.Eikonal(torch.zeros(1, 3), torch.zeros(1, 3), 1.0, 0.1, 0.1, 1.0), kernels.Smooth(torch.zeros(1, 3), 1.0, 0.1),
+            kernels.Sampling(20.0, 0.1, 1, 1),
         )  # fmt: skip
         kernels.learn(kernels.arrange(step))
 

@@ -10,6 +10,7 @@ import torch
 from mmsynth.field import kernels, rendering
 from mmsynth.field.field import Field
 from mmsynth.fitting.measurements import Batch, Measurements, batch_of
+from mmsynth.fitting.smoothness import neighbours
 
 
 @dataclass(frozen=True)
@@ -18,25 +19,26 @@ class ToDraw:
 
     Attributes:
         rays: how many of each modality. drawings: of the photosites that are learned from, and of those outside of masks, if there are any.
-        points: how many, random ones of all space, and near what rays meet. generator: the random numbers of these, and of what else is due
-            in the step.
+        points: how many, random ones of all space, near what rays meet, and neighbours of what they meet. generator: the random
+            numbers of these, and of what else is due in the step.
     """
 
     rays: dict[str, int]
     drawings: Sequence[kernels.Drawing]
-    points: tuple[int, int]
+    points: tuple[int, int, int]
     generator: torch.Generator
 
 
 @dataclass(frozen=True)
 class DrawnStep:
-    """A batch, its rays with those outside of masks after them, points (N, 3) of all space, in the frame of the grid, and noise (P, 3),
-    standard normal. generator: see ``ToDraw``."""
+    """A batch, its rays with those outside of masks after them, points (N, 3) of all space, in the frame of the grid, noise (P, 3),
+    standard normal, and neighbours, see ``kernels.Smooth``. generator: see ``ToDraw``."""
 
     batch: Batch
     rays: kernels.Rays
     points: torch.Tensor
     noise: torch.Tensor
+    aside: torch.Tensor
     generator: torch.Generator
 
 
@@ -48,7 +50,8 @@ def drawn_step(field: Field, measurements: Measurements, asked: ToDraw, drawn: S
         origins, directions = torch.cat([origins, more.origins]), torch.cat([directions, more.directions])
         jitter = torch.cat([jitter, more.jitter])
     near, far = rendering.interval(field.surface, origins, directions)
-    anywhere, close = asked.points
+    anywhere, close, pairs = asked.points
     points = (torch.rand(anywhere, 3, generator=asked.generator) * 2 - 1) * field.surface.grid.extent
     noise = torch.randn(close, 3, generator=asked.generator)
-    return DrawnStep(batch, kernels.Rays(origins, directions, near, far, jitter), points, noise, asked.generator)
+    aside = neighbours(pairs, asked.generator)
+    return DrawnStep(batch, kernels.Rays(origins, directions, near, far, jitter), points, noise, aside, asked.generator)

@@ -24,7 +24,7 @@ from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.kernels.cuda import drawing, optimiser, stepping
 from mmsynth.field.kernels.cuda.learning import learn_all
 from mmsynth.field.kernels.learning import gradient_of
-from mmsynth.fitting import importance
+from mmsynth.fitting import importance, smoothness
 from mmsynth.fitting.graphs import Repeated
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.measurements import Measurements
@@ -46,7 +46,8 @@ class Stage:
 
     Attributes:
         active: levels of surface and radiance. degrees: of direction, of each modality. lamps: those that there are. far_light, gains:
-            whether there are. early: whether slopes below 1 count less. rays, outside: of each modality, those drawn and those where
+            whether there are. early: whether slopes below 1 count less. pairs: of neighbouring
+            normals that are pulled together. rays, outside: of each modality, those drawn and those where
             nothing is.
     """
 
@@ -56,6 +57,7 @@ class Stage:
     far_light: bool
     gains: bool
     early: bool
+    pairs: int
     rays: tuple[int, ...]
     outside: tuple[int, ...]
 
@@ -166,11 +168,12 @@ class DeviceStep:
             begin += size
         return flat, begins
 
-    def stage(self, sampling: kernels.Sampling, rays: float, decided: bool, gains: bool, early: bool, outside: int) -> Stage:
+    def stage(self, sampling: kernels.Sampling, rays: float, decided: bool, gains: bool, early: bool, pairs: int, outside: int) -> Stage:
         """Of a step with so many rays of all modalities, and one in ``outside`` as many where nothing is.
 
         Args:
-            decided: whether far light is seen. gains: whether exposures differ. early: whether slopes below 1 count less.
+            decided: whether far light is seen. gains: whether exposures differ. early: whether slopes below 1 count less. pairs: see
+                ``Stage``.
         """
         share = [self.needs.share[n] for n in self.order]
         counts = tuple(max(1, int(bucket(rays) * s / sum(share))) for s in share)
@@ -178,7 +181,7 @@ class DeviceStep:
         light = self.field.light
         return Stage(
             (sampling.active_surface, sampling.active_radiance), tuple(self.field.view_dependence[n] for n in self.order),
-            self.lamps if light is not None else (), decided and self.field.far_light is not None, gains, early, counts, empty,
+            self.lamps if light is not None else (), decided and self.field.far_light is not None, gains, early, pairs, counts, empty,
         )  # fmt: skip
 
     def renew(self) -> None:
@@ -262,11 +265,13 @@ class DeviceStep:
                     (origins[rays:], directions[rays:], jitter[rays:]),
                 )  # fmt: skip
             aimed, view, opacities = stepping.aim(drawn, origins, directions, jitter, tables, known, bounds, contracted)
-            at, noise = stepping.random_points(numbers, free, asked, grid.extent, 3.0)
+            at, noise, aside = stepping.random_points(
+                numbers, (free, asked, stage.pairs), grid.extent, 3.0, (smoothness.LEAST, smoothness.MOST)
+            )
             eikonal = kernels.Eikonal(at, noise, loss.eikonal_weight, cell, MIRROR_CELLS * cell, shallow)
             told = kernels.Step(
                 *surface, appearance, field.occupancy.states, shader, network, far_light, aimed, view, drawn.measured,
-                kernels.Gains(log_gain, drawn.frame), opacities, eikonal, now,
+                kernels.Gains(log_gain, drawn.frame), opacities, eikonal, smoothness.smooth(aside, self.recipe), now,
             )  # fmt: skip
             loss_parts, squared, samples = learn_all(told, of_shader, of_light)
             f = self.flat

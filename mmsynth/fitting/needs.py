@@ -44,7 +44,7 @@ class Needs:
         black_background: whether black pixels say that nothing is there.
         sparse: modalities that learn their colours from the geometry and appearance of the others: with so few pixels that they would
             spoil what others know better, or without the masks of the object that others have.
-        smooth: whether normals of neighbouring rays are pulled together, outside of the region.
+        smooth: whether normals of neighbouring places are pulled together, outside of the region.
         share: of the rays that each modality gets, relative to a plentiful one.
         choices: by name; what is decided later is in ``Trainer.choices``.
     """
@@ -124,7 +124,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
     spheres = _initial_spheres(facts, background.value)
     share = _ray_shares(facts)
     rows = _table_rows(facts)
-    smooth = _smooth(facts, background.value, on_gpu)
+    smooth = _smooth(facts, background.value)
     choices: dict[str, Choice[Any]] = {
         "masks": _masks(facts),
         "background": background,
@@ -260,7 +260,7 @@ def _ray_shares(f: _Facts) -> Choice[dict[str, float]]:
     return Choice(share, why, bool(sparse))
 
 
-def _smooth(f: _Facts, background: bool, on_gpu: bool) -> Choice[bool]:
+def _smooth(f: _Facts, background: bool) -> Choice[bool]:
     """Do few views see what lies outside the region?"""
     views = len({frame.view for frame in f.scene.frames if frame.sensor in f.measurements and frame.view in f.scene.split.train})
     seen, loss = f"{views} training views", f.recipe.loss
@@ -268,9 +268,7 @@ def _smooth(f: _Facts, background: bool, on_gpu: bool) -> Choice[bool]:
         return switch(False, "no surfaces outside of the region are modelled")
     if views > loss.smooth_views or loss.smooth_weight == 0:
         return switch(False, seen)
-    if on_gpu:
-        return switch(False, f"{seen} are few, but steps on a GPU do not pull normals together yet")
-    return switch(True, f"{seen}: outside of the region normals of neighbouring rays are pulled together")
+    return switch(True, f"{seen}: outside of the region normals of neighbouring places are pulled together")
 
 
 def _tensor_head(f: _Facts) -> Choice[bool]:

@@ -11,7 +11,6 @@ from mmsynth.fitting.optimiser import BETAS
 from mmsynth.fitting.recipe import Recipe
 
 _LONG_MEMORY = 0.999  # β₂ of a thousand steps
-_SMOOTH_EVERY = 4  # steps: as good as each of them, at a quarter of its cost
 
 
 def sampling_at(progress: float, recipe: Recipe, needs: Needs) -> Sampling:
@@ -84,12 +83,6 @@ def learning_rate_factor(progress: float, recipe: Recipe) -> float:
 def is_early(progress: float, recipe: Recipe) -> bool:
     """Whether levels are still to open."""
     return progress < recipe.schedule.levels_until
-
-
-def smooth_weight(step: int, progress: float, recipe: Recipe) -> float:
-    """Of the pull between normals in this step, where few views see a scene."""
-    due = step % _SMOOTH_EVERY == 0 and progress < recipe.schedule.smooth_until
-    return _SMOOTH_EVERY * recipe.loss.smooth_weight if due else 0.0
 
 
 def blocked_weight(early: bool, recipe: Recipe) -> float:

@@ -38,11 +38,10 @@ from mmsynth.fitting.schedule import (
     light_looks,
     samples_of_step,
     sampling_at,
-    smooth_weight,
     surface_beta2,
     surface_rates,
 )
-from mmsynth.fitting.smoothness import pull_together
+from mmsynth.fitting.smoothness import pairs_at, smooth
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, eikonal_points, opacities
@@ -164,9 +163,6 @@ class Trainer:
             asked = self._to_draw(state.step, state.rays)
             drawn = drawn_step(self.field, self.measurements, asked, [kernels.draw(*drawing) for drawing in asked.drawings])
         self._prepare(sampling, drawn.generator)
-        weight = smooth_weight(state.step, done, self.recipe) if self.needs.smooth else 0.0
-        if weight > 0:
-            pull_together(self.field, drawn.batch.origins, drawn.batch.directions, sampling, weight, (self.seed, 4, state.step))
         asked, arranged = self.arranged or self._arrange(drawn, state.step)
         rays, state.rays, errors = state.rays, state.rays_after, dict[str, float]()
 
@@ -210,7 +206,9 @@ class Trainer:
         """A step that the device takes while the host goes on; what earlier ones told is taken in."""
         state, done = self.state, self.progress
         early = is_early(done, self.recipe)
-        stage = step.stage(sampling, state.rays, state.decided is not None, self._has_gains, early, _OUTSIDE)
+        stage = step.stage(
+            sampling, state.rays, state.decided is not None, self._has_gains, early, pairs_at(done, self.recipe, self.needs), _OUTSIDE
+        )
         factor, of_surface = learning_rate_factor(done, self.recipe), surface_rates(sampling.sharpness, self.recipe)
         step.run(stage, sampling, state.step, factor, of_surface, surface_beta2(done, self.needs))
         self._average()
@@ -295,12 +293,13 @@ class Trainer:
         counts = {n: max(1, int(rays * share / total)) for n, share in self.needs.share.items()}
         selection = self.importance.selection if self.renewed is None else self.renewed
         of_pixels = drawing_of(self.measurements, self.field.shader.columns, counts, random, selection)
+        points = *self.points, pairs_at(self._progress_at(step), self.recipe, self.needs)
         if not self.has_empty:
-            return ToDraw(counts, (of_pixels,), self.points, generator)
+            return ToDraw(counts, (of_pixels,), points, generator)
         # rays outside the object's masks, whose opacity should be 0. Their colours are those of a background that is not the object's, or
         # of a picture that was painted white there: they are not looked at
         outside = {name: -(-count // _OUTSIDE) for name, count in counts.items()}
-        return ToDraw(counts, (of_pixels, empty_drawing_of(self.measurements, outside, random)), self.points, generator)
+        return ToDraw(counts, (of_pixels, empty_drawing_of(self.measurements, outside, random)), points, generator)
 
     def _wrong(self, learned: kernels.Learned) -> str | None:
         """What is wrong where the loss or its gradients are not finite, and then no gradient is left."""
@@ -352,7 +351,8 @@ class Trainer:
             field.shader.weights(), light, far_light, rays, kernels.View(degrees, trains), batch.measured,
             kernels.Gains(log_gain, batch.frame),
             opacities(batch, outside, self.has_opacity, self.needs.black_background, self.recipe, progress),
-            eikonal(field, sampling, self.recipe, progress, drawn.points, drawn.noise), sampling, self.recipe.sampling.roulette,
+            eikonal(field, sampling, self.recipe, progress, drawn.points, drawn.noise), smooth(drawn.aside.to(self.device), self.recipe),
+            sampling, self.recipe.sampling.roulette,
         )  # fmt: skip
 
     def _errors(self, batch: Batch, squared: torch.Tensor) -> dict[str, float]:

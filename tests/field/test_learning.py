@@ -81,6 +81,7 @@ def _step(
         "eikonal": kernels.Eikonal(
             (torch.rand(100, 3) * 2 - 1) * extent, torch.empty(0, 3) if lamps else 0.05 * torch.randn(120, 3), 0.1, 0.08, 0.16, 0.3
         ),
+        "smooth": kernels.Smooth(0.1 * torch.randn(30, 3), 0.1, 0.05),
         "sampling": kernels.Sampling(30.0, 2 / 30, 3, 3),
         "roulette": 0.0,
     }
@@ -98,7 +99,7 @@ def _told(step: dict[str, Any], dtype: torch.dtype, active: int = 3) -> tuple[ke
     told = kernels.Step(
         grid, network, modules["appearance"].at(active), step["states"], modules["shader"].weights(), modules["light"].network(), far_light,
         tuples["rays"], tuples["view"], tuples["measured"], tuples["gains"]._replace(log_gain=log_gain), tuples["opacities"],
-        tuples["eikonal"], step["sampling"], step["roulette"],
+        tuples["eikonal"], tuples["smooth"], step["sampling"], step["roulette"],
     )  # fmt: skip
     return told, {f"{n}.{k}": p for n, m in modules.items() for k, p in m.named_parameters()} | {"far": far_light, "gain": log_gain}
 
@@ -126,6 +127,8 @@ def test_a_step_is_that_of_the_definition(case: str) -> None:
     truth, expected = _run(step, torch.float64)
     found, gradients = _run(step, torch.float32)
     assert abs(found.loss.item() - truth.loss.item()) < 2e-5 * truth.loss.item()
+    alone, _ = _run(step | {"smooth": step["smooth"]._replace(weight=0.0)}, torch.float32)
+    assert (found.loss > alone.loss) == (step["surface"].grid.extent > 1.0)  # what is outside of the ball has neighbours
     assert abs(int(found.samples) - int(truth.samples)) <= 2  # a step may round to the other side of a cell's face
     assert set(expected) == set(gradients)
     for learned, of_all in ((found, gradients), (truth, expected)):

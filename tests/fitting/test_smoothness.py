@@ -1,4 +1,4 @@
-"""Normals of neighbouring rays outside of the region, pulled together."""
+"""Normals of neighbouring places outside of the region, pulled together."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import numpy as np
 import torch
 from analytic import RGB
 
+from mmsynth.field import kernels, rendering
 from mmsynth.field.design import Design
 from mmsynth.field.field import Field
-from mmsynth.fitting.smoothness import pull_together
+from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.smoothness import LEAST, MOST, PAIRS, neighbours, smooth
 from mmsynth.scene.scene import Region
 
 OUT = 1.8  # radii in contracted space, of the horizon that rays from within meet
+RAYS = 1024
 
 
 def _field(horizon: float, rough: float) -> Field:
@@ -29,17 +32,29 @@ def _field(horizon: float, rough: float) -> Field:
     return field
 
 
-def _rays(rays: int = 200) -> tuple[torch.Tensor, torch.Tensor]:
+def _rays(rays: int = RAYS) -> tuple[torch.Tensor, torch.Tensor]:
     directions = np.random.default_rng(1).normal(size=(rays, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return torch.from_numpy(0.5 * directions).float(), torch.from_numpy(directions).float()
 
 
-def _pulled(field: Field, seed: int = 0) -> dict[str, torch.Tensor]:
+def _pulled(field: Field, origins: torch.Tensor, directions: torch.Tensor, seed: int = 0) -> tuple[float, dict[str, torch.Tensor]]:
+    """The loss of a step of which nothing else is asked, and gradients."""
     for parameter in field.parameters():
         parameter.grad = None
-    pull_together(field, *_rays(), field.sampling, 1.0, (seed,))
-    return {name: parameter.grad.clone() for name, parameter in field.named_parameters() if parameter.grad is not None}
+    none, index, count, sampling = torch.empty(0), torch.empty(0, dtype=torch.int64), len(origins), field.sampling
+    jitter = torch.full((count,), 0.5)
+    rays = kernels.Rays(origins, directions, *rendering.interval(field.surface, origins, directions), jitter)
+    view = kernels.View(torch.zeros(count, dtype=torch.int64), torch.ones(count, dtype=torch.bool))
+    nothing = torch.empty(0, 3)
+    pull = smooth(neighbours(PAIRS, torch.Generator().manual_seed(seed)), Recipe())
+    found = kernels.learn(kernels.arrange(kernels.Step(
+        *field.surface.at(3), field.appearance.at(2), field.occupancy.states, field.shader.weights(), kernels.no_light("cpu"), none, rays,
+        view, kernels.Measured(none, index, index, nothing, none, none, none), kernels.Gains(none, index),
+        kernels.Opacities(none, none, none, none, 0.05), kernels.Eikonal(nothing, nothing, 0.0, 0.1, 0.1, 1.0), pull, sampling,
+    )))  # fmt: skip
+    gradients = {name: p.grad.clone() for name, p in field.named_parameters() if p.grad is not None and p.grad.any()}
+    return float(found.loss), gradients
 
 
 @torch.no_grad()
@@ -57,7 +72,7 @@ def test_bumps_of_a_wall_get_smaller() -> None:
     before = _roughness(field)
     assert before > 0.01
     for step in range(60):
-        gradients = _pulled(field, step)
+        _, gradients = _pulled(field, *_rays(), step)
         assert set(gradients) == {"surface.hidden", "surface.output_weight", "surface.grid.table"}
         with torch.no_grad():
             for name, parameter in field.named_parameters():
@@ -66,18 +81,24 @@ def test_bumps_of_a_wall_get_smaller() -> None:
     assert _roughness(field) < 0.5 * before
 
 
-def test_a_step_has_one_pull() -> None:
-    field = _field(OUT, 0.02)
-    one, again, other = _pulled(field, 1), _pulled(field, 1), _pulled(field, 2)
-    assert all(torch.equal(one[name], again[name]) for name in one)
-    assert not torch.equal(one["surface.hidden"], other["surface.hidden"])
+def test_of_a_smooth_ball_there_is_what_its_curvature_makes() -> None:
+    """Places r apart on a ball seen from its centre, ``aside`` of random directions: by the angle between them."""
+    field = _field(OUT, 0.0)
+    loss, _ = _pulled(field, *_rays())
+    aside = neighbours(PAIRS, torch.Generator().manual_seed(0))
+    chosen = _rays()[1][torch.arange(PAIRS) * RAYS // PAIRS]
+    cosine = torch.nn.functional.cosine_similarity(chosen, chosen + aside, dim=-1)
+    expected = 0.01 * ((1.0 - cosine) / (1.0 - cosine + 0.3)).mean()
+    assert abs(loss / float(expected) - 1.0) < 0.02
 
 
 def test_what_is_in_the_region_is_not_asked() -> None:
     field = _field(OUT, 0.02)
     origins, directions = _rays()
     inwards = 3.0 * origins / torch.linalg.vector_norm(origins, dim=-1, keepdim=True)  # the small ball in the middle
-    for parameter in field.parameters():
-        parameter.grad = None
-    pull_together(field, inwards, -directions, field.sampling, 1.0, (0,))
-    assert all(parameter.grad is None for parameter in field.parameters())
+    assert _pulled(field, inwards, -directions) == (0.0, {})
+
+
+def test_neighbours_are_as_far_as_they_may_be() -> None:
+    length = torch.linalg.vector_norm(neighbours(5000, torch.Generator().manual_seed(0)), dim=-1)
+    assert LEAST <= float(length.min()) < 1.1 * LEAST and 0.99 * MOST < float(length.max()) <= 1.0001 * MOST

@@ -25,6 +25,8 @@ MOSTLY_BLOCKED = 0.5  # opacity of a ray that does not only graze an edge
 HUBER_DELTA = 0.5  # relative residuals above it count linearly
 LEAST_ROUGHNESS = 0.02  # sharper images than any pixel could tell
 REFRACTIVE_INDEX = 1.5  # of what mirrors lamps: glass, plastics, varnish
+SOFT_EDGE = 0.3  # 1 - n·n' of two normals at half of the most that they are pulled together by: edges feel little of it
+RAYS_OF_PAIR = 8  # at least, for each whose surface has a neighbour
 LEAST_WEIGHT = 1e-12  # of a ray's sections, by which its features are divided
 
 # of a ray's random numbers, what each decides

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import linear, normalize
 
 from mmsynth.field.kernels import reference
-from mmsynth.field.kernels.constants import LEAST_WEIGHT, MOSTLY_BLOCKED
+from mmsynth.field.kernels.constants import LEAST_WEIGHT, MOSTLY_BLOCKED, RAYS_OF_PAIR, SOFT_EDGE
 from mmsynth.field.kernels.parameters import (
     Eikonal,
     GridTable,
@@ -20,6 +20,7 @@ from mmsynth.field.kernels.parameters import (
     Mirrors,
     Rays,
     ShadedRays,
+    Smooth,
     Step,
     SurfaceNetwork,
     View,
@@ -48,9 +49,9 @@ def no_light(device: torch.device | str) -> LightNetwork:
 def learn(step: Step) -> Learned:
     """The loss of R rays, and its gradients, which are added to ``grad`` of all tables, weights, lamps and gains.
 
-    It is the photometric loss (see ``compare``), ``Opacities`` and ``Eikonal``.
+    It is the photometric loss (see ``compare``), ``Opacities``, ``Eikonal`` and ``Smooth``.
     """
-    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, _ = step
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, smooth, sampling, _ = step
     count = len(rays.origins)
     hits = reference.trace(grid, network, appearance, states, rays, sampling)
     ray = rays_of(hits.behind, len(hits.share))
@@ -72,6 +73,7 @@ def learn(step: Step) -> Learned:
     asked = len(eikonal.points) + (count if len(light.used) else len(eikonal.noise))
     off = torch.linalg.vector_norm(slopes, dim=-1) - 1.0
     loss = loss + eikonal.weight / max(asked, 1) * (torch.where(off < 0.0, shallow, 1.0) * off.square()).sum()
+    loss = loss + _pull_together(hits, grid, network, rays, smooth)
     loss.backward()
     learned = *network[:2], *shader, *light[:-1], far_light, gains.log_gain
     return Learned(loss.detach(), sum_of_gradients(learned), squared, hits.samples)
@@ -135,6 +137,26 @@ def asked_rays(rays: int, asked: int) -> Tensor:
     """Of so many rays those, evenly spaced, of which something is asked: (min(rays, asked),)."""
     asked = min(rays, asked)
     return torch.arange(asked) * rays // max(asked, 1)
+
+
+def pairs_of(rays: int, smooth: Smooth) -> int:
+    """Of so many rays how many have a neighbour."""
+    return min(len(smooth.aside), rays // RAYS_OF_PAIR)
+
+
+def _pull_together(hits: Hits, grid: GridTable, network: SurfaceNetwork, rays: Rays, smooth: Smooth) -> Tensor:
+    """See ``Smooth``."""
+    pairs = pairs_of(len(rays.origins), smooth)
+    chosen = asked_rays(len(rays.origins), pairs).to(hits.depth.device)
+    depth, distance = hits.depth[chosen], lambda x: torch.linalg.vector_norm(x, dim=-1)
+    points = rays.origins[chosen] + rays.directions[chosen] * depth[:, None]
+    beside = points + smooth.aside[:pairs] * distance(points)[:, None]
+    asked = torch.isfinite(depth) & (distance(points) > 1.0) & (distance(beside) > 1.0)
+    points = torch.cat([points[asked], beside[asked]])
+    at = reference.contract(points) if grid.extent > 1.0 else points
+    one, other = normals(points, surface_gradient(at, smooth.epsilon, grid, network), grid.extent).chunk(2)
+    apart = 0.5 * (one - other).square().sum(-1)
+    return smooth.weight / max(pairs, 1) * (apart / (apart + SOFT_EDGE)).sum()
 
 
 def _at_points(hits: Hits, grid: GridTable, network: SurfaceNetwork, rays: Rays, eikonal: Eikonal) -> tuple[Tensor, Tensor]:

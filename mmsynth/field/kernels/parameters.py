@@ -259,6 +259,20 @@ class Eikonal(NamedTuple):
     shallow: float
 
 
+class Smooth(NamedTuple):
+    """Where normals are pulled together: those of some of the surfaces that rays meet, and of places a little beside them, where both are
+    outside of the unit ball. Of normals n, n' it is e / (e + c), e = 1 - n·n', c = ``constants.SOFT_EDGE``.
+
+    Attributes:
+        aside: (K, 3): of K of the R rays, evenly spaced and one in ``constants.RAYS_OF_PAIR`` at the most, how far beside the surface they
+            meet, in distances of it from the centre. weight: of the term, a mean over these rays. epsilon: of the differences.
+    """
+
+    aside: Tensor
+    weight: float
+    epsilon: float
+
+
 class Step(NamedTuple):
     """What a step of a fit is told, see ``learning.learn``.
 
@@ -283,6 +297,7 @@ class Step(NamedTuple):
     gains: Gains
     opacities: Opacities
     eikonal: Eikonal
+    smooth: Smooth
     sampling: Sampling
     roulette: float = 0.0
 

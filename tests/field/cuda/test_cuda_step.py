@@ -36,7 +36,7 @@ def test_steps_learn_and_one_that_is_not_finite_is_not_taken(device: str, monkey
         field, trainer.measurements, trainer.importance, trainer.optimiser, trainer.log_gain, trainer.needs, trainer.recipe, 0
     )
     sampling = sampling_at(0.1, trainer.recipe, trainer.needs)
-    stage = step.stage(sampling, 10, decided=True, gains=True, early=True, outside=4)
+    stage = step.stage(sampling, 10, decided=True, gains=True, early=True, pairs=2, outside=4)
     before, table = step.flat.values.clone(), field.surface.grid.table.detach().clone()
     for number in (0, 1):  # the last layer of the surface begins with zeros: the hidden one moves with the second step
         step.run(stage, sampling, number, 1.0, SurfaceRates(0.5, 0.75), 0.875)

@@ -67,12 +67,16 @@ def test_points_are_even_and_noise_is_normal(device: str) -> None:
     assert float(numbers.sharpness) == 60.0 and numbers.factors.tolist() == [0.5, 0.125, 0.375]
     assert numbers.beta2.tolist() == [0.5, 0.25, 0.75]
     assert float(numbers.step) == pytest.approx(0.03) and [x % 2**32 for x in numbers.key.tolist()] == [1, 2**32 - 1, 3, 4]
-    points, noise = stepping.random_points(numbers, 3000, 4000, 2.0, 3.0)
+    points, noise, aside = stepping.random_points(numbers, (3000, 4000, 3500), 2.0, 3.0, (0.2, 0.4))
     assert float(points.abs().max()) <= 2.0 and float((points.mean(0)).abs().max()) < 0.1
     torch.testing.assert_close(points.std(0).cpu(), torch.full((3,), 2.0 / 3**0.5), atol=0.05, rtol=0)
     torch.testing.assert_close(noise.std(0).cpu(), torch.full((3,), 3.0 / 60.0), atol=0.003, rtol=0)
     assert float(torch.corrcoef(noise.T).fill_diagonal_(0.0).abs().max()) < 0.06
     assert float((noise / 0.05).pow(4).mean()) == pytest.approx(3.0, abs=0.3)
+    length = torch.linalg.vector_norm(aside, dim=-1, keepdim=True)
+    assert 0.199 < float(length.min()) < 0.202 and 0.398 < float(length.max()) < 0.401
+    torch.testing.assert_close((aside / length).pow(2).mean(0).cpu(), torch.full((3,), 1 / 3), atol=0.02, rtol=0)
+    assert float((aside / length).mean(0).abs().max()) < 0.04 and float(length.mean()) == pytest.approx(0.3, abs=0.004)
 
 
 @pytest.mark.parametrize("good", [True, False])

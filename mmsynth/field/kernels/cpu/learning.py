@@ -24,7 +24,7 @@ from mmsynth.field.kernels.cpu.mirrors import mirrors_backward, mix, mix_backwar
 from mmsynth.field.kernels.cpu.optimiser import take_parts
 from mmsynth.field.kernels.cpu.roulette import first_chance, least_of, play
 from mmsynth.field.kernels.cpu.shading import clear_gradients, compare_rays, first_at
-from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_points
+from mmsynth.field.kernels.cpu.slopes import POINTS, learn_met, learn_pairs, learn_points
 from mmsynth.field.kernels.cpu.stack import on_stack
 from mmsynth.field.kernels.cpu.tasks import take, tell, wait
 from mmsynth.field.kernels.cpu.tracing_gradients import rays_backward
@@ -73,7 +73,7 @@ class WeightGradients(NamedTuple):
 @part()
 def _learn_rays(  # type: ignore[no-untyped-def]
     chunk, slot, begin, count, total, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light,
-    view, measured, gain, opacities, eikonal, roulette, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
+    view, measured, gain, opacities, eikonal, smooth, roulette, asked, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
     g_mirrored, g_gain,
 ):  # fmt: skip
     """All of a chunk of rays, of which ``begin`` is the first: its loss."""
@@ -132,6 +132,7 @@ def _learn_rays(  # type: ignore[no-untyped-def]
             )  # fmt: skip
     if not shines:
         loss += learn_met(begin, count, total, here, depth, eikonal, of_pull, roulette, grid, surface, scratch, slot, chunk, taps)
+    loss += learn_pairs(begin, count, total, here, depth, smooth, roulette, grid, surface, scratch, slot, chunk, taps)
     if len(opacities.target):
         for i in range(count):
             off = opacity[i] - opacities.target[begin + i]
@@ -205,7 +206,8 @@ def _size(row, width):  # type: ignore[no-untyped-def]
 @kernel
 def learn_rays(  # type: ignore[no-untyped-def]
     next_task, rays, states, sampling, grid, surface, appearance, layers, heads, heads_bias, light, lamps, far_light, view, measured, gain,
-    opacities, eikonal, roulette, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+    opacities, eikonal, smooth, roulette, ahead, ahead_too, store, kept, taps, shaded, scratch, out, samples, squared, mirrored,
+    g_mirrored, g_gain,
 ):  # fmt: skip
     """See ``learning.learn``: what it leaves per chunk, ``finish`` adds up. Chunks of rays, then points, and then rays of the next step to
     draw, until no task is left.
@@ -223,8 +225,8 @@ def learn_rays(  # type: ignore[no-untyped-def]
             begin = chunk * CHUNK
             out.loss[chunk] = _learn_rays(
                 chunk, worker, begin, np.int64(min(CHUNK, total - begin)), total, rays, states, sampling, grid, surface, appearance, layers,
-                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, roulette, asked, store, kept, taps,
-                shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
+                heads, heads_bias, light, lamps, far_light, view, measured, gain, opacities, eikonal, smooth, roulette, asked, store, kept,
+                taps, shaded, scratch, out, samples, squared, mirrored, g_mirrored, g_gain,
             )  # fmt: skip
             continue
         begin = (chunk - chunks) * POINTS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,16 +9,16 @@ import numpy as np
 from mmsynth.field.kernels.constants import LEAST_WEIGHT
 from mmsynth.field.kernels.cpu import mirroring
 from mmsynth.field.kernels.cpu.jit import allocating_kernel, part
-from mmsynth.field.kernels.cpu.marching import CHUNK, contract, velocity
+from mmsynth.field.kernels.cpu.marching import CHUNK, contract
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, add_product, clear, whole
 from mmsynth.field.kernels.cpu.mirroring import mirror_rays, mirror_rays_backward
 from mmsynth.field.kernels.cpu.shading import layer, layer_backward, two_layers
-from mmsynth.field.kernels.cpu.slopes import pull_to_one, slopes, slopes_backward
+from mmsynth.field.kernels.cpu.slopes import normal_backward, normal_of, pull_to_one, slopes, slopes_backward
 from mmsynth.field.kernels.parameters import Lamps, Mirrors
 
 _f = np.float32
 _ZERO, _ONE = _f(0.0), _f(1.0)
-_LEAST_WEIGHT, _TINY = _f(LEAST_WEIGHT), _f(1e-12)
+_LEAST_WEIGHT = _f(LEAST_WEIGHT)
 
 
 class ChunkScratch(NamedTuple):
@@ -151,13 +150,7 @@ def see_mirrors(begin, count, ray0, rays, taps, lamps, light, measured, scratch,
     clear(x, whole(n, TILE_ROWS), x.shape[1])
     for i in range(n):
         row = row_of[i]
-        sx, sy, sz = found[i, 0], found[i, 1], found[i, 2]
-        if wide:
-            px, py, pz = points[row, 0], points[row, 1], points[row, 2]
-            r = _f(math.sqrt(px * px + py * py + pz * pz))
-            sx, sy, sz = velocity(px, py, pz, r, sx, sy, sz)
-        norm = max(_f(math.sqrt(sx * sx + sy * sy + sz * sz)), _TINY)
-        normals[row, 0], normals[row, 1], normals[row, 2] = sx / norm, sy / norm, sz / norm
+        normal_of(points[row], found[i], wide, normals[row])
         for j in range(width):
             x[i, j] = features[row, j]
     layer(n, x, whole(width, TILE_COLS), light.first_turned, light.first_bias, h)
@@ -196,20 +189,7 @@ def mirrors_backward(  # type: ignore[no-untyped-def]
             for k in range(g_material.shape[1]):
                 gy[i, k] = g_material[row, k]
                 out.second_bias[chunk, k] += gy[i, k]
-            sx, sy, sz = found[i, 0], found[i, 1], found[i, 2]
-            px, py, pz = points[row, 0], points[row, 1], points[row, 2]
-            r = _f(math.sqrt(px * px + py * py + pz * pz))
-            if wide:
-                sx, sy, sz = velocity(px, py, pz, r, sx, sy, sz)
-            norm = max(_f(math.sqrt(sx * sx + sy * sy + sz * sz)), _TINY)
-            along = _ZERO
-            for a in range(3):
-                along += normals[row, a] * g_normals[row, a]
-            gx = (g_normals[row, 0] - along * normals[row, 0]) / norm
-            gy_, gz = (g_normals[row, 1] - along * normals[row, 1]) / norm, (g_normals[row, 2] - along * normals[row, 2]) / norm
-            if wide:  # symmetric
-                gx, gy_, gz = velocity(px, py, pz, r, gx, gy_, gz)
-            at[i, 0], at[i, 1], at[i, 2] = gx, gy_, gz
+            normal_backward(points[row], found[i], wide, normals[row], g_normals[row], at[i])
         loss += pull_to_one(found[i], of_pull, _ONE, at[i])
     slopes_backward(at, n, eikonal.mirror_epsilon, roulette, grid, surface, taps, chunk, scratch.gates[slot], first)
     add_product(gy.T, h, out.second[chunk], gy.shape[1], n, h.shape[1])

@@ -47,7 +47,9 @@ def learn(
 ) -> Learned:
     """See ``kernels.learn`` and ``learning.learn``; float32, ``measured.ray`` never decreasing."""
     step, (made, ahead) = arranged.step, arranged.made
-    table, network, look, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, roulette = made
+    table, network, look, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, smooth, sampling, roulette = (
+        made
+    )
     count, numbers, points = len(rays.origins), len(measured.target), len(eikonal.points)
     chunks, threads = -(-count // CHUNK), kernel_threads()
     tasks = chunks + -(-points // slopes.POINTS)
@@ -68,7 +70,7 @@ def learn(
     first, second = (*(to_fill for to_fill, _ in ahead), nothing_to_draw(), nothing_to_draw())[:2]
     to_learn = (
         np.zeros(2, np.int64), rays, states, sampling, table, surface_layers(network), look, *shader_layers(shader), shining, lamps,
-        far_light, view, measured, gain, opacities, eikonal, roulette, first, second, store.arrays, kept.arrays, taps.arrays,
+        far_light, view, measured, gain, opacities, eikonal, smooth, roulette, first, second, store.arrays, kept.arrays, taps.arrays,
         weights.arrays, scratch.arrays, out.arrays, samples, squared, mirrored, g_mirrored, g_gain,
     )  # fmt: skip
     sums, done = np.zeros(2), np.zeros(1 + table.active + look.active, np.int64)

@@ -16,7 +16,7 @@ from mmsynth.field.kernels.cpu.learning import TableStore
 from mmsynth.field.kernels.cpu.marching import CAPACITY, CHUNK
 from mmsynth.field.kernels.cpu.matrices import TILE_COLS, TILE_ROWS, whole
 from mmsynth.field.kernels.cpu.mirrors import ChunkScratch, LightOut
-from mmsynth.field.kernels.cpu.slopes import MOST_TAPPED, TapStore
+from mmsynth.field.kernels.cpu.slopes import MOST_PAIRED, MOST_TAPPED, TapStore
 from mmsynth.field.kernels.cpu.surface import POINTS
 from mmsynth.field.kernels.cpu.units import GATES
 from mmsynth.field.kernels.parameters import ShaderWeights
@@ -24,7 +24,7 @@ from mmsynth.field.kernels.parameters import ShaderWeights
 S = TypeVar("S", bound=tuple[Any, ...])
 _SPARE = 4  # times the slots that are needed: larger arrays are for others
 _IDLE = 100  # stores that were asked for since: what was not used again is let go
-_TAPS = 4 * MOST_TAPPED + TILE_ROWS  # rows of the points of a chunk
+_TAPS = 4 * (MOST_TAPPED + MOST_PAIRED) + TILE_ROWS  # rows of the points of a chunk
 _pool: list[tuple[Any, Any, int]] = []  # of each, when it was given back
 _asked = itertools.count()
 _changing = threading.RLock()  # of the pool. A thread that holds it may find garbage to give back

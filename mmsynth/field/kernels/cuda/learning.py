@@ -13,7 +13,7 @@ from mmsynth.field.kernels.cuda import mirroring
 from mmsynth.field.kernels.cuda.light import material, material_backward
 from mmsynth.field.kernels.cuda.shading import compare_all, programs_of
 from mmsynth.field.kernels.cuda.shared import jit, tl, triton
-from mmsynth.field.kernels.cuda.slopes import eikonal_programs, eikonal_term, normals_backward, places
+from mmsynth.field.kernels.cuda.slopes import normals_backward, places, slopes_programs, terms_of_slopes
 from mmsynth.field.kernels.cuda.surface import surface_gradient
 from mmsynth.field.kernels.cuda.tracing import trace
 from mmsynth.field.kernels.learning import gradient_of, sum_of_gradients
@@ -109,16 +109,16 @@ def learn_all(step: Step, of_shader: Tensor, of_light: Tensor) -> tuple[Tensor, 
     Returns:
         the loss (n,) float64, to be summed; squared and samples, see ``Learned``.
     """
-    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, sampling, _ = step
+    grid, network, appearance, states, shader, light, far_light, rays, view, measured, gains, opacities, eikonal, smooth, sampling, _ = step
     with torch.enable_grad():
         hits = trace(grid, network, appearance, states, rays, sampling)
     features, share, shines = hits.features.detach(), hits.share.detach(), len(light.used) > 0
-    where = places(hits, rays, eikonal, grid.extent, shines)
+    where = places(hits, rays, eikonal, smooth, grid.extent, shines)
     with torch.enable_grad():
         slopes = surface_gradient(where.at, where.epsilons, grid, network)
     programs = programs_of(len(rays.origins))
-    loss = torch.empty(programs + eikonal_programs(where), dtype=torch.float64, device=features.device)
-    found = eikonal_term(slopes.detach(), where, eikonal, grid.extent, loss[programs:])
+    loss = torch.empty(programs + sum(slopes_programs(where)), dtype=torch.float64, device=features.device)
+    found = terms_of_slopes(slopes.detach(), where, eikonal, smooth, grid.extent, loss[programs:])
     gain = _gain_of(gains) if len(gains.log_gain) else None
     mirrored = None
     if shines:

@@ -166,8 +166,10 @@ def aim(
 
 
 @jit
-def points_kernel(points, noise, key, sharpness, count, asked, extent, soft, two_pi, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Even in the grid; normal, as wide as the soft surface: by Box and Muller."""
+def points_kernel(  # type: ignore[no-untyped-def]
+    points, noise, aside, key, sharpness, count, asked, pairs, extent, soft, least, most, two_pi, BLOCK: tl.constexpr
+):
+    """Even in the grid; normal, as wide as the soft surface, by Box and Muller; even over directions and lengths."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     a, b = unit(random_bits(key, i, 3)), unit(random_bits(key, i, 4))
     c, d = unit(random_bits(key, i, 5)), unit(random_bits(key, i, 6))
@@ -179,16 +181,26 @@ def points_kernel(points, noise, key, sharpness, count, asked, extent, soft, two
     tl.store(noise + 3 * i, one * tl.cos(two_pi * b), mask=i < asked)
     tl.store(noise + 3 * i + 1, one * tl.sin(two_pi * b), mask=i < asked)
     tl.store(noise + 3 * i + 2, two * tl.cos(two_pi * d), mask=i < asked)
+    up = 2.0 * unit(random_bits(key, i, 7)) - 1.0  # even on the sphere: so is the height
+    around = two_pi * unit(random_bits(key, i, 8))
+    length = least + (most - least) * unit(random_bits(key, i, 9))
+    across = length * tl.sqrt(tl.maximum(1.0 - up * up, 0.0))
+    tl.store(aside + 3 * i, across * tl.cos(around), mask=i < pairs)
+    tl.store(aside + 3 * i + 1, across * tl.sin(around), mask=i < pairs)
+    tl.store(aside + 3 * i + 2, length * up, mask=i < pairs)
 
 
-def random_points(numbers: Numbers, count: int, asked: int, extent: float, soft: float) -> tuple[Tensor, Tensor]:
-    """``Eikonal.points`` (count, 3) and ``noise`` (asked, 3) of ``soft`` / sharpness; one launch."""
-    points, noise = (torch.empty(n, 3, device=numbers.key.device) for n in (count, asked))
+def random_points(
+    numbers: Numbers, counts: tuple[int, int, int], extent: float, soft: float, beside: tuple[float, float]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """So many ``Eikonal.points`` and ``noise`` of ``soft`` / sharpness, and ``Smooth.aside`` of lengths from ``beside``, (·, 3) each; one
+    launch."""
+    points, noise, aside = (torch.empty(n, 3, device=numbers.key.device) for n in counts)
     with torch.cuda.device_of(numbers.key):
-        points_kernel[(triton.cdiv(max(count, asked, 1), BLOCK),)](
-            points, noise, numbers.key, numbers.sharpness, count, asked, extent, soft, _TWO_PI, BLOCK
+        points_kernel[(triton.cdiv(max(*counts, 1), BLOCK),)](
+            points, noise, aside, numbers.key, numbers.sharpness, *counts, extent, soft, *beside, _TWO_PI, BLOCK
         )
-    return points, noise
+    return points, noise, aside
 
 
 @jit
