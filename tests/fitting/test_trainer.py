@@ -457,7 +457,7 @@ def _loss(trainer: Trainer, batch: Any, **changes: Any) -> float:
     sampling = sampling_at(0.2, trainer.recipe, trainer.needs)
     generator = torch.Generator().manual_seed(0)
     points, noise = torch.rand(256, 3, generator=generator) * 2 - 1, torch.randn(768, 3, generator=generator)
-    drawn = DrawnStep(batch, _rays(trainer, batch), points, noise, generator)
+    drawn = DrawnStep(batch, _rays(trainer, batch), points, noise, torch.empty(0, 3), generator)
     return float(kernels.learn(kernels.arrange(trainer._of_step(drawn, sampling, trainer.progress))).loss)
 
 
