@@ -88,7 +88,7 @@ def test_of_a_smooth_ball_there_is_what_its_curvature_makes() -> None:
     aside = neighbours(PAIRS, torch.Generator().manual_seed(0))
     chosen = _rays()[1][torch.arange(PAIRS) * RAYS // PAIRS]
     cosine = torch.nn.functional.cosine_similarity(chosen, chosen + aside, dim=-1)
-    expected = 0.01 * ((1.0 - cosine) / (1.0 - cosine + 0.3)).mean()
+    expected = Recipe().loss.smooth_weight * ((1.0 - cosine) / (1.0 - cosine + 0.3)).mean()
     assert abs(loss / float(expected) - 1.0) < 0.02
 
 
