@@ -198,7 +198,7 @@ class LossRecipe(_Section):
     )
     eikonal_points: int = _key(1024, "Points of a step that are asked for it [points].", ge=8)
     smooth_weight: float = _key(
-        0.003,
+        0.01,
         "Weight of the pull between normals of neighbouring places outside of the region, where views are few [1]; 0: none.",
         ge=0,
     )
