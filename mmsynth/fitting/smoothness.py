@@ -17,7 +17,7 @@ from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import Recipe
 
 PAIRS = 128  # of a step
-LEAST, MOST = 0.01, 0.04  # how far beside it a place is, in its distance from the region's centre
+LEAST, MOST = 0.01, 0.04  # how far beside it a place is, in its distance from the region's centre: from farther a table bends into its wall
 _EPSILON = 0.03  # of the differences that normals are found by, in the frame of the grid
 
 
