@@ -109,11 +109,11 @@ def expected_rays(recipe: Recipe, steps: int | None, budget: float | None, on_gp
     return steps * (max(samples, SAMPLES_ON_GPU) if on_gpu else samples) / _SAMPLES_PER_RAY
 
 
-def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, rays_to_come: float, on_gpu: bool = False) -> Needs:
+def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, rays_to_come: float) -> Needs:
     """Look at the cameras and at some random pixels of each modality.
 
     Args:
-        rays_to_come: about how many rays the fit will see (``expected_rays``). on_gpu: see there.
+        rays_to_come: about how many rays the fit will see (``expected_rays``).
     """
     pixels = sum(m.pixels for m in measurements.values())
     seen = _look_outside(measurements, np.random.default_rng((seed, 7)))

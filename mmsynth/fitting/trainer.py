@@ -79,7 +79,7 @@ class Trainer:
         fused = self.device.type == "cuda" and kernels.fused_on_gpu()
         rays_to_come = expected_rays(recipe, steps, budget, fused)
         self.measurements: Measurements = load_measurements(scene, rays_to_come=rays_to_come, device=self.device, on_load=on_load)
-        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come, fused)
+        self.needs: Needs = assess(scene, self.measurements, recipe, seed, rays_to_come)
         sensors = {n: m.sensor for n, m in self.measurements.items()}
         radiance_scale = {n: m.radiance_scale for n, m in self.measurements.items()}
         cameras = {n: m.cameras[0] for n, m in self.measurements.items()}
