@@ -20,9 +20,9 @@ from mmsynth.field.radiance import Shader
 from mmsynth.fitting.candidates import Look, by_modality, look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
+from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import RadianceRecipe
 
-DEGREES = 3  # of spherical harmonics
 _RAYS = 2048  # per modality, that exposures are asked of
 _SURE = 2.0  # standard errors
 
@@ -40,13 +40,19 @@ class Decisions:
 
 
 def decide(
-    field: Field, measurements: Measurements, recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int, held: Tensor | None
+    field: Field,
+    measurements: Measurements,
+    recipe: RadianceRecipe,
+    needs: Needs,
+    sampling: kernels.Sampling,
+    seed: int,
+    held: Tensor | None,
 ) -> Decisions:
     """Put the residuals of a field as it is to the tests of this module; ``held``: tiles that it has not learned directions from."""
     random = np.random.default_rng((seed, 2))
     judged = look(field, measurements, _RAYS, sampling, random)
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, *look_twice(field, measurements, sampling, random, held))
+        errors = errors_by_degree(field.shader, needs.directions, *look_twice(field, measurements, sampling, random, held))
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         asked = recipe.view_dependence
@@ -71,7 +77,8 @@ def _degree(errors: Tensor, degree: int) -> Choice[int]:
     means = errors.mean(1).tolist() if errors.shape[1] else [0.0]
     best = means[-1]
     grown = ", ".join(f"{e / best - 1:+.1%}" for e in means[:-1]) if best > 0 else "nothing that could be told apart"
-    return Choice(degree, f"degree {degree}: error with degree 0, 1, 2 in place of 3: {grown}", degree > 0)
+    others = ", ".join(map(str, range(len(errors) - 1)))
+    return Choice(degree, f"degree {degree}: error with degree {others} in place of {len(errors) - 1}: {grown}", degree > 0)
 
 
 @torch.no_grad()
@@ -92,13 +99,13 @@ def _exposure(field: Field, judged: Look, measurements: Measurements, recipe: Ra
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
 
 
-def errors_by_degree(shader: Shader, learned: Sequence[Look], judged: Sequence[Look]) -> dict[str, Tensor]:
-    """Squared errors of each modality with directions up to degree 0, 1, ... ``DEGREES``, at rays that were not learned from.
+def errors_by_degree(shader: Shader, most: int, learned: Sequence[Look], judged: Sequence[Look]) -> dict[str, Tensor]:
+    """Squared errors of each modality with directions up to degree 0, 1, ... ``most``, at rays that were not learned from.
 
     Returns:
-        by modality, (DEGREES + 1, N); N = 0 where every number is clipped.
+        by modality, (most + 1, N); N = 0 where every number is clipped.
     """
-    return by_modality([squared_errors(shader, learned, judged, degree) for degree in range(DEGREES + 1)], judged)
+    return by_modality([squared_errors(shader, learned, judged, degree) for degree in range(most + 1)], judged)
 
 
 def degree_needed(errors: Tensor, worth: float) -> int:

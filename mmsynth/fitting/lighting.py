@@ -13,8 +13,8 @@ from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
 from mmsynth.fitting.candidates import by_modality, look, look_twice, squared_errors
 from mmsynth.fitting.choices import Choice, switch
-from mmsynth.fitting.decisions import DEGREES
 from mmsynth.fitting.measurements import Batch, Measurements, draw
+from mmsynth.fitting.needs import DEGREES, Needs
 from mmsynth.fitting.recipe import RadianceRecipe
 
 _RAYS = 4096  # per modality
@@ -81,12 +81,21 @@ def look_for_lamps(field: Field, measurements: Measurements, sampling: kernels.S
 
 
 def decide_light(
-    field: Field, measurements: Measurements, recipe: RadianceRecipe, sampling: kernels.Sampling, seed: int, held: Tensor | None
+    field: Field,
+    measurements: Measurements,
+    recipe: RadianceRecipe,
+    needs: Needs,
+    sampling: kernels.Sampling,
+    seed: int,
+    held: Tensor | None,
 ) -> Choice[bool]:
     """Whether the lamps of a field that has learned with them are worth it.
 
     Two copies of the shader learn on, one of them without the lamps, and are compared: see ``candidates``. The modality counts that lamps
-    save most of: of few full-size views, that is the one behind analysers. ``held``: tiles of the views that judge, see ``held_out``.
+    save most of: of few full-size views, that is the one behind analysers. They cost time; few views run out before it does, and are given
+    lamps that save anything beyond doubt: what the shader paints in their place is wrong between the views.
+
+    ``held``: tiles of the views that judge, see ``held_out``.
     """
     if recipe.light == "off":
         return switch(False, "asked for by the recipe")
@@ -102,8 +111,8 @@ def decide_light(
     why = f"{lamps} lamps, mirrored, save {saved:.1%} (±{unsure:.1%}) of {modality}'s error at rays not learned from"
     if recipe.light == "on":
         return switch(True, f"asked for by the recipe; {why}")
-    worth = max(recipe.light_min_improvement, _SURE * unsure)
-    return switch(saved >= worth, f"{why}; costs a normal for each surface met" if saved >= worth else f"{why}, {worth:.1%} asked for")
+    worth = max(0.0 if needs.few else recipe.light_min_improvement, _SURE * unsure)
+    return switch(saved > worth, f"{why}; costs a normal for each surface met" if saved > worth else f"{why}, {worth:.1%} asked for")
 
 
 def _saved(lit: Tensor, unlit: Tensor) -> tuple[float, float]:

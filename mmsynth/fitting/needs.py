@@ -22,6 +22,8 @@ from mmsynth.scene.scene import MaskMeaning, Scene
 from mmsynth.sensors.camera import Camera
 
 _FACES = 6  # of a cube: the cells that a surface may occupy, in units of the resolution squared
+DEGREES = 3  # of spherical harmonics
+_FEW = 12  # training views: with 13 as much is won as lost by what is done for few
 _OUTERMOST = 2.0  # distance of the farthest camera, at which the sphere around everything stands at the start
 _COARSE = 128  # cells across the grid that a surface may have however few the measurements: small pictures show large things
 _LOOKED_AT = 4096  # pixels of a modality, to see what is outside
@@ -44,6 +46,8 @@ class Needs:
         black_background: whether black pixels say that nothing is there.
         sparse: modalities that learn their colours from the geometry and appearance of the others: with so few pixels that they would
             spoil what others know better, or without the masks of the object that others have.
+        few: whether it is the number of training views that limits a fit, and not that of its steps.
+        directions: the highest degree of the harmonics of direction that may be chosen.
         smooth: whether normals of neighbouring places are pulled together, outside of the region.
         share: of the rays that each modality gets, relative to a plentiful one.
         choices: by name; what is decided later is in ``Trainer.choices``.
@@ -55,6 +59,8 @@ class Needs:
     sharpness_until: float
     black_background: bool
     sparse: tuple[str, ...]
+    few: bool
+    directions: int
     smooth: bool
     share: dict[str, float]
     choices: dict[str, Choice[Any]]
@@ -91,6 +97,16 @@ class _Facts:
         return max(1.0, math.sqrt(self.pixels / self.rays_to_come))
 
     @property
+    def views(self) -> int:
+        """That train."""
+        seen = [f for f in self.scene.frames if f.sensor in self.measurements and f.view in self.scene.split.train]
+        return len({frame.view for frame in seen})
+
+    @property
+    def few(self) -> bool:
+        return self.views <= _FEW
+
+    @property
     def transparent(self) -> bool:
         return self.scene.black_background or any(m.has_opacity for m in self.measurements.values())
 
@@ -124,6 +140,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
     spheres = _initial_spheres(facts, background.value)
     share = _ray_shares(facts)
     rows = _table_rows(facts)
+    directions = _directions(facts)
     smooth = _smooth(facts, background.value)
     choices: dict[str, Choice[Any]] = {
         "masks": _masks(facts),
@@ -132,6 +149,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
         "resolution": resolution,
         "initial_sphere": spheres,
         "sparse": share,
+        "directions": directions,
         "smooth": smooth,
         "tensor_head": _tensor_head(facts),
     }
@@ -162,6 +180,8 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
         sharpness_until=recipe.schedule.sharpness_until * _sooner(rays_to_come),
         black_background=not background.value and facts.outside >= _PAST,
         sparse=tuple(n for n, s in share.value.items() if s < 1.0 or n in facts.unmasked),
+        few=facts.few,
+        directions=directions.value,
         smooth=smooth.value,
         share=share.value,
         choices=choices,
@@ -260,13 +280,22 @@ def _ray_shares(f: _Facts) -> Choice[dict[str, float]]:
     return Choice(share, why, bool(sparse))
 
 
+def _directions(f: _Facts) -> Choice[int]:
+    """How far may radiance depend on direction? Few views tell as many harmonics apart as they are; what lies between or beside them would
+    be painted by chance, and one of them, held out, says little of that."""
+    asked = f.recipe.radiance.view_dependence
+    if asked != "auto":
+        return Choice(asked, f"degree {asked}: {_BY_RECIPE}", asked > 0)
+    degree = max((d for d in range(DEGREES + 1) if (d + 1) ** 2 <= f.views), default=0) if f.few else DEGREES
+    return Choice(degree, f"degree {degree} at the most: {f.views} training views", f.few)
+
+
 def _smooth(f: _Facts, background: bool) -> Choice[bool]:
     """Do few views see what lies outside the region?"""
-    views = len({frame.view for frame in f.scene.frames if frame.sensor in f.measurements and frame.view in f.scene.split.train})
-    seen, loss = f"{views} training views", f.recipe.loss
+    seen = f"{f.views} training views"
     if not background:
         return switch(False, "no surfaces outside of the region are modelled")
-    if views > loss.smooth_views or loss.smooth_weight == 0:
+    if not f.few or f.recipe.loss.smooth_weight == 0:
         return switch(False, seen)
     return switch(True, f"{seen}: outside of the region normals of neighbouring places are pulled together")
 

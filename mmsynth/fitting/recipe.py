@@ -62,7 +62,9 @@ class RadianceRecipe(_Section):
     rays_per_row: float = _key(75.0, "Rays of the whole fit for each row of a level's table [rays]; fewer rays: fewer rows.", gt=0)
     hidden_width: int = _key(64, "Width of the shader's hidden layer.", ge=4, le=256)
     view_dependence: Literal["auto", 0, 1, 2, 3] = _key(
-        "auto", "Degree of the spherical harmonics of radiance over directions; auto: views judge that are held out until then."
+        "auto",
+        "Degree of the spherical harmonics of radiance over directions; auto: views judge that are held out until then, and few views "
+        "have no more harmonics than they are.",
     )
     view_dependence_min_improvement: float = _key(
         0.03, "Share of the error that a higher degree must save [1], where the degree is auto.", ge=0
@@ -70,7 +72,8 @@ class RadianceRecipe(_Section):
     light: Switch = _key("auto", "Lamps that surfaces mirror: highlights, and their polarization, by place, normal and roughness.")
     light_min_improvement: float = _key(
         0.02,
-        "Share of a modality's error at rays not learned from that lamps must save [1], where light is auto; two standard errors at least.",
+        "Share of a modality's error at rays not learned from that lamps must save [1], where light is auto; two standard errors at least, "
+        "and no more where views are few.",
         ge=0,
     )
     exposure: Switch = _key("auto", "An exposure factor of every frame.")
@@ -202,7 +205,6 @@ class LossRecipe(_Section):
         "Weight of the pull between normals of neighbouring places outside of the region, where views are few [1]; 0: none.",
         ge=0,
     )
-    smooth_views: int = _key(12, "Training views up to which they are few [views].", ge=0)
     background_opacity_weight: float = _key(1.0, "Weight of opacity on black pixels of a scene whose background is black [1].", ge=0)
     alpha_weight: float = _key(
         0.5, "Weight of the squared difference of opacity and alpha, where images have it or masks of an object say it [1].", ge=0

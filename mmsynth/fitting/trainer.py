@@ -21,13 +21,13 @@ from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.fitting.ahead import DrawnStep, ToDraw, drawn_step
 from mmsynth.fitting.choices import Choice
-from mmsynth.fitting.decisions import DEGREES, Decisions, decide
+from mmsynth.fitting.decisions import Decisions, decide
 from mmsynth.fitting.held_out import held_out_tiles
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.measurements import Batch, Measurements, draw, drawing_of, empty_drawing_of, fingerprint, load_measurements
 from mmsynth.fitting.motions import RayJacobian
-from mmsynth.fitting.needs import Needs, assess, expected_rays
+from mmsynth.fitting.needs import DEGREES, Needs, assess, expected_rays
 from mmsynth.fitting.optimiser import Adam, Average
 from mmsynth.fitting.progress import FitProgress, FitState
 from mmsynth.fitting.recipe import Recipe
@@ -256,7 +256,7 @@ class Trainer:
             state.light_looks += 1
             dark = not field.shines
         if state.light is None and (dark or self.progress >= schedule.light_until):
-            state.light = decide_light(field, self.measurements, self.recipe.radiance, sampling, self.seed, held)
+            state.light = decide_light(field, self.measurements, self.recipe.radiance, self.needs, sampling, self.seed, held)
             self._mirror(state.light)
             look_for_lamps(field, self.measurements, sampling, self.seed)
         if state.decided is None:
@@ -264,7 +264,7 @@ class Trainer:
             seen = 0 if self.progress < schedule.view_dependence_from else DEGREES
             field.view_dependence.update(dict.fromkeys(self.measurements, seen))
             if self.progress >= schedule.decide_at:
-                state.decided = decide(field, self.measurements, self.recipe.radiance, sampling, self.seed, held)
+                state.decided = decide(field, self.measurements, self.recipe.radiance, self.needs, sampling, self.seed, held)
                 if field.shines:  # by now lamps have found their places
                     keep_bright_lamps(field, self.measurements, sampling, self.seed)
                 self._see_directions(state.decided)

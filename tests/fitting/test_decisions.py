@@ -7,8 +7,9 @@ import torch
 from mmsynth.field import kernels
 from mmsynth.field.radiance import Shader
 from mmsynth.fitting.candidates import Look
-from mmsynth.fitting.decisions import DEGREES, choose_degrees, degree_needed, errors_by_degree, exposure_spread
+from mmsynth.fitting.decisions import choose_degrees, degree_needed, errors_by_degree, exposure_spread
 from mmsynth.fitting.measurements import Batch
+from mmsynth.fitting.needs import DEGREES
 from mmsynth.scene.scene import Sensor
 
 
@@ -75,7 +76,7 @@ def test_the_degree_that_light_has_is_found(needed: int) -> None:
     learned, judged = _seen(2048, needed), _seen(2048, needed)
     shader = _taught(learned)
     before = [p.detach().clone() for p in shader.parameters()]
-    errors = errors_by_degree(shader, [learned], [judged])["grey"]
+    errors = errors_by_degree(shader, DEGREES, [learned], [judged])["grey"]
     assert len(errors) == DEGREES + 1
     assert degree_needed(errors, worth=0.1) == needed, errors
     assert all(bool((p == q).all()) for p, q in zip(shader.parameters(), before, strict=True))  # copies learned, not the shader
@@ -88,7 +89,8 @@ def test_a_degree_does_not_hang_on_the_few_rays_that_were_drawn() -> None:
     seen = lambda rays: _seen(rays, 1, 0.3, 0.5)
     shader = _taught(seen(8192))
     degrees = lambda looks: [
-        degree_needed(errors_by_degree(shader, *[[seen(n) for _ in range(looks)] for n in (128, 256)])["grey"], 0.03) for _ in range(8)
+        degree_needed(errors_by_degree(shader, DEGREES, *[[seen(n) for _ in range(looks)] for n in (128, 256)])["grey"], 0.03)
+        for _ in range(8)
     ]
     assert len(set(degrees(1))) > 1 and set(degrees(64)) == {1}
 

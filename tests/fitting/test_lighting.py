@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,7 @@ def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
         light.second.weight[1:4] = 0.0
         light.second.bias[1:4] = -200.0
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto", "light_min_improvement": 1e-6})
-    choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0, None)
+    choice = decide_light(trainer.field, trainer.measurements, recipe, trainer.needs, sampling, 0, None)
     assert not choice.value and "save 0.0%" in choice.why
 
 
@@ -134,8 +135,27 @@ def test_the_modality_that_lamps_save_most_of_decides(scene: Scene, monkeypatch:
 
     monkeypatch.setattr(lighting, "squared_errors", errors)
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto"})
-    choice = decide_light(trainer.field, trainer.measurements, recipe, sampling, 0, None)
+    choice = decide_light(trainer.field, trainer.measurements, recipe, trainer.needs, sampling, 0, None)
     assert choice.value and "save 10.0% (±0.0%) of pol's error" in choice.why
+
+
+def test_few_views_keep_lamps_that_surely_save_anything(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What they cost is time, and few views run out before it does."""
+    trainer, sampling = _ready(scene)
+    few_looks(monkeypatch, rays=512)
+
+    def decided(saved: float, spread: float, few: bool) -> bool:
+        def errors(shader: Any, learned: list[Look], judged: list[Look], degree: int, mirrors: bool) -> list[torch.Tensor]:
+            random = torch.Generator().manual_seed(0)
+            noise = [spread * torch.randn(len(seen.usable), generator=random) for seen in judged]
+            return [1.0 - saved + of_look - of_look.mean() if mirrors else torch.ones_like(of_look) for of_look in noise]
+
+        monkeypatch.setattr(lighting, "squared_errors", errors)
+        recipe, needs = trainer.recipe.radiance.model_copy(update={"light": "auto"}), replace(trainer.needs, few=few)
+        return decide_light(trainer.field, trainer.measurements, recipe, needs, sampling, 0, None).value
+
+    assert decided(0.01, 0.0, few=True) and not decided(0.01, 0.0, few=False)
+    assert not decided(0.01, 10.0, few=True) and decided(0.03, 0.0, few=False)
 
 
 def test_views_that_are_held_out_judge_lamps(monkeypatch: pytest.MonkeyPatch) -> None:
