@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 from analytic import MONO, AnalyticField, Distance, sphere, torus
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from skimage.measure import marching_cubes
 
@@ -108,13 +108,15 @@ def test_no_part_of_a_learned_field_is_lost(seed: int) -> None:
     st.integers(20, 40),
     st.integers(5, 48),
 )
+@example(balls=[(0.0, 0.0, -0.28, 0.03)], n=20, block=5)
 def test_any_balls_are_closed_and_none_is_lost(balls: list[tuple[float, float, float, float]], n: int, block: int) -> None:
     def union(p: np.ndarray) -> np.ndarray:
         return np.min([np.linalg.norm(p - np.array(c[:3]), axis=-1) - c[3] for c in balls], axis=0)
 
     axis = np.arange(-1, n + 2) * 2 / n - 1
-    shows = union(np.stack(np.meshgrid(axis, axis, axis), -1)).min() < 0
-    if not shows:
+    least = union(np.stack(np.meshgrid(axis, axis, axis), -1)).min()
+    assume(abs(least) > 1e-12)  # a ball that touches one point of the lattice is there or not by how its place is rounded
+    if least > 0:
         with pytest.raises(InputError, match="no surface"):
             mesh_of(union, n, block, keep="all")
         return
