@@ -55,8 +55,7 @@ def decide(
         errors = errors_by_degree(field.shader, needs.directions, *look_twice(field, measurements, sampling, random, held))
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
-        asked = recipe.view_dependence
-        degrees = dict.fromkeys(measurements, Choice(asked, f"degree {asked}: asked for by the recipe", asked > 0))
+        degrees = dict.fromkeys(measurements, needs.choices["directions"])
     return Decisions(degrees, _exposure(field, judged, measurements, recipe))
 
 
