@@ -9,7 +9,7 @@ all where they see directions. Many rays judge, too: errors have long tails.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from mmsynth.field.radiance import Shader
 from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.optimiser import Adam
+from mmsynth.parallel import tile_by_tile
 
 _LOOKS, _RAYS = 8, 2048  # that judge, of so many rays of a modality each, and as many, half as large, that copies learn from in turn
 _STEPS = 40
@@ -52,7 +53,11 @@ def look(
     selection: kernels.Selection | None = None,
 ) -> Look:
     """So many rays of each modality, as the field renders them; ``selection``: of which pixels, None: of all that are learned from."""
-    batch = draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, selection)
+    return _seen(field, draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, selection), sampling)
+
+
+@torch.no_grad()
+def _seen(field: Field, batch: Batch, sampling: kernels.Sampling) -> Look:
     hits = field.trace(batch.origins, batch.directions, sampling)
     return Look(batch, hits, field.mirrored(hits, batch.origins, batch.directions, batch.measured, sampling.active_surface))
 
@@ -61,19 +66,38 @@ def look_twice(
     field: Field, measurements: Measurements, sampling: kernels.Sampling, random: np.random.Generator, held: Tensor | None
 ) -> tuple[list[Look], list[Look]]:
     """What copies learn from, and what judges them; ``held``: tiles that judge and are not learned from."""
+
+    def looks(rays: int, selection: kernels.Selection | None) -> list[Look]:
+        counts = dict.fromkeys(measurements, rays)
+        batches = (draw(measurements, field.shader.columns, counts, random, selection) for _ in range(_LOOKS))
+        return [seen for _, seen in tile_by_tile(field.device, lambda batch: _seen(field, batch, sampling), batches)]
+
     learned, judged = selections(measurements, held)
-    return (
-        [look(field, measurements, _RAYS // 2, sampling, random, learned) for _ in range(_LOOKS)],
-        [look(field, measurements, _RAYS, sampling, random, judged) for _ in range(_LOOKS)],
-    )
+    return looks(_RAYS // 2, learned), looks(_RAYS, judged)
 
 
-def squared_errors(shader: Shader, learned: Sequence[Look], judged: Sequence[Look], degree: int, mirrors: bool = True) -> list[Tensor]:
-    """Squared errors of the numbers of looks, (M,) each, by a copy of the shader that has learned on from others.
+def errors_of_copies(
+    shader: Shader, learned: Sequence[Look], judged: Sequence[Look], copies: Iterable[tuple[int, bool]]
+) -> dict[str, Tensor]:
+    """Squared errors of copies of the shader that have learned on, side by side, by modality.
 
     Args:
-        degree: of the harmonics of the direction that the copy sees. mirrors: whether mirrored light is added to its own.
+        copies: degree of the harmonics of the direction that each sees, and whether mirrored light is added to its own.
+    Returns:
+        (copies, N) at the numbers that can be judged; N = 0 where every number is clipped.
     """
+    work = lambda of_copy: squared_errors(shader, learned, judged, *of_copy)
+    squared = [errors for _, errors in tile_by_tile(judged[0].batch.origins.device, work, copies)]
+    out: dict[str, list[Tensor]] = {name: [] for name in judged[0].batch.parts}
+    for seen, *of_look in zip(judged, *squared, strict=True):
+        errors, usable = torch.stack(of_look), seen.usable
+        for name, (_, numbers) in seen.batch.parts.items():
+            out[name].append(errors[:, numbers][:, usable[numbers]])
+    return {name: torch.cat(parts, 1) for name, parts in out.items()}
+
+
+def squared_errors(shader: Shader, learned: Sequence[Look], judged: Sequence[Look], degree: int, mirrors: bool) -> list[Tensor]:
+    """Of the numbers of looks, (M,) each, by one copy that has learned on from others."""
     candidate = copy.deepcopy(shader)
     parameters = dict(candidate.named_parameters())
     optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
@@ -83,17 +107,6 @@ def squared_errors(shader: Shader, learned: Sequence[Look], judged: Sequence[Loo
         optimiser.step(1.0 - step / _STEPS)
     with torch.no_grad():
         return [_compare(candidate, seen, degree, mirrors)[1] for seen in judged]
-
-
-def by_modality(squared: Sequence[Sequence[Tensor]], judged: Sequence[Look]) -> dict[str, Tensor]:
-    """Errors of several copies, each as ``squared_errors`` gives them, by modality: (copies, N) at the numbers that can be judged; N = 0
-    where every number is clipped."""
-    out: dict[str, list[Tensor]] = {name: [] for name in judged[0].batch.parts}
-    for seen, *of_look in zip(judged, *squared, strict=True):
-        errors, usable = torch.stack(of_look), seen.usable
-        for name, (_, numbers) in seen.batch.parts.items():
-            out[name].append(errors[:, numbers][:, usable[numbers]])
-    return {name: torch.cat(parts, 1) for name, parts in out.items()}
 
 
 def _compare(shader: Shader, seen: Look, degree: int, mirrors: bool) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.candidates import Look, by_modality, look, look_twice, squared_errors
+from mmsynth.fitting.candidates import Look, errors_of_copies, look, look_twice
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.needs import Needs
@@ -104,7 +104,7 @@ def errors_by_degree(shader: Shader, most: int, learned: Sequence[Look], judged:
     Returns:
         by modality, (most + 1, N); N = 0 where every number is clipped.
     """
-    return by_modality([squared_errors(shader, learned, judged, degree) for degree in range(most + 1)], judged)
+    return errors_of_copies(shader, learned, judged, [(degree, True) for degree in range(most + 1)])
 
 
 def degree_needed(errors: Tensor, worth: float) -> int:

@@ -11,7 +11,7 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import MIRROR_CELLS, Field
 from mmsynth.field.light import find_lamps
-from mmsynth.fitting.candidates import by_modality, look, look_twice, squared_errors
+from mmsynth.fitting.candidates import errors_of_copies, look, look_twice
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.needs import DEGREES, Needs
@@ -103,7 +103,7 @@ def decide_light(
         return switch(False, "from no direction surfaces are brighter than from others")
     random = np.random.default_rng((seed, 10))
     learned, judged = look_twice(field, measurements, sampling, random, held)
-    errors = by_modality([squared_errors(field.shader, learned, judged, DEGREES, mirrors) for mirrors in (True, False)], judged)
+    errors = errors_of_copies(field.shader, learned, judged, [(DEGREES, True), (DEGREES, False)])
     of_each = {name: _saved(*own) for name, own in errors.items()}
     modality = max(of_each, key=lambda name: of_each[name][0])
     saved, unsure = of_each[modality]

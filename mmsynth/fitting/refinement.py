@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Batch, Measurements
 from mmsynth.fitting.motions import Motions, NormalEquations, RayJacobian, Saved
 from mmsynth.fitting.recipe import PosesRecipe
+from mmsynth.parallel import tile_by_tile
 from mmsynth.scene.scene import Scene
 
 _AT_ONCE = 1024  # rays of a batch: all that it goes through is kept for the way back
@@ -27,7 +28,7 @@ _PER_STEP, _PER_VIEW = 4096, 64  # rays of a step at least
 _PER_FIT = 400_000  # rays from the beginning to the end of a fit, where each step moves cameras
 _PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
 
-Look = Callable[[dict[str, int], np.random.Generator], RayJacobian]
+Looks = Callable[[dict[str, int], int, np.random.Generator], Iterable[RayJacobian]]
 
 
 @dataclass(frozen=True)
@@ -43,30 +44,36 @@ class MotionDecisions:
 
 
 def ray_residuals(
-    field: Field, batch: Batch, degrees: Tensor, gain: Tensor | None, far_light: bool, sampling: kernels.Sampling
-) -> RayJacobian:
-    """Residuals of rays, the mean over what was measured along each, in units of the modality's level, and their derivatives.
+    field: Field, batches: Iterable[Batch], gain_of: Callable[[Batch], Tensor | None], far_light: bool, sampling: kernels.Sampling
+) -> Iterator[RayJacobian]:
+    """Residuals of rays, the mean over what was measured along each, in units of the modality's level, and their derivatives; batches side
+    by side.
 
     Args:
-        degrees: (R,) of the harmonics of direction. gain: (M,) factors of what is predicted, None: 1.
+        gain_of: (M,) factors of what is predicted of a batch, None: 1.
         far_light: whether light from beyond the region is seen.
     """
-    origins, directions = (x.detach().requires_grad_() for x in (batch.origins, batch.directions))
     field.requires_grad_(False)  # rays alone: tables would gather gradients that the next step of the fit takes for its own
     try:
-        with torch.enable_grad():
-            hits = field.trace(origins, directions, sampling)
-            shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind, len(hits.share))
-            outputs = field.shader(shaded.features, directions[ray], degrees[ray])
-            predicted = kernels.predict(outputs, shaded.share, batch.measured, hits.behind)
-            predicted = predicted + field.mirrored(hits, origins, directions, batch.measured, sampling.active_surface)
-            relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.measured.level
-            mean = origins.new_zeros(len(origins)).index_add(0, batch.measured.ray, relative) / torch.bincount(
-                batch.measured.ray, minlength=len(origins)
-            )
-            gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
+        of_batch = lambda batch: _residuals(field, batch, gain_of(batch), far_light, sampling)
+        yield from (rows for _, rows in tile_by_tile(field.device, of_batch, batches))
     finally:
         field.requires_grad_(True)
+
+
+@torch.enable_grad()
+def _residuals(field: Field, batch: Batch, gain: Tensor | None, far_light: bool, sampling: kernels.Sampling) -> RayJacobian:
+    origins, directions = (x.detach().requires_grad_() for x in (batch.origins, batch.directions))
+    hits = field.trace(origins, directions, sampling)
+    shaded, ray = field.with_far_light(hits) if far_light else hits, kernels.rays_of(hits.behind, len(hits.share))
+    outputs = field.shader(shaded.features, directions[ray], batch.per_ray(field.view_dependence)[ray])
+    predicted = kernels.predict(outputs, shaded.share, batch.measured, hits.behind)
+    predicted = predicted + field.mirrored(hits, origins, directions, batch.measured, sampling.active_surface)
+    relative = kernels.residual(predicted if gain is None else predicted * gain, batch.measured) / batch.measured.level
+    mean = origins.new_zeros(len(origins)).index_add(0, batch.measured.ray, relative) / torch.bincount(
+        batch.measured.ray, minlength=len(origins)
+    )
+    gradients = torch.autograd.grad(mean.sum(), (origins, directions))  # rays know nothing of each other
     frame = batch.measured.ray.new_zeros(len(origins)).scatter(0, batch.measured.ray, batch.frame)
     return RayJacobian(frame.cpu(), *(x.detach().cpu().double() for x in (mean, *gradients, batch.directions)))
 
@@ -101,17 +108,17 @@ class Refinement:
         """Whether it is time for a step, or to decide."""
         return (self.decided is None or self.decided.any) and progress >= self.next
 
-    def step(self, look: Look, progress: float) -> None:
+    def step(self, looks: Looks, progress: float) -> None:
         """Decide, if that is not done, and move the cameras by what rays of all frames say.
 
         Args:
-            look: rays of the present field, a number of each modality: their residuals and derivatives.
+            looks: at rays of the present field, a number of each modality, so many times: their residuals and derivatives.
         """
         random = np.random.default_rng((self.seed, 3, self.steps))
         rays = max(_PER_STEP, _PER_VIEW * len(self.layout.views))
         count = -(-rays // _AT_ONCE) if self.decided is not None else max(_DECIDE, -(-rays // _AT_ONCE))
         counts = {n: -(-_AT_ONCE * len(m.origins) // len(self.layout.view)) for n, m in self.measurements.items()}
-        equations = poses.normal_equations((look(counts, random) for _ in range(count)), poses.moved(self.layout, self.motions))
+        equations = poses.normal_equations(looks(counts, count, random), poses.moved(self.layout, self.motions))
         self.steps += 1
         self.next = progress + rays / _PER_FIT
         if not np.isfinite(equations.matrix).all() or not equations.error.sum() > 0:

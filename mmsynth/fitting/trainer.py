@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -269,7 +270,7 @@ class Trainer:
                     keep_bright_lamps(field, self.measurements, sampling, self.seed)
                 self._see_directions(state.decided)
         if state.step % _MOVE_EVERY == 0 and self.refinement.due(self.progress):
-            self.refinement.step(functools.partial(self._look, sampling), self.progress)
+            self.refinement.step(functools.partial(self._looks, sampling), self.progress)
         settled = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided)), *field.view_dependence.values()
         if settled != self.settled:
             self.settled, self.arranged = settled, None
@@ -380,10 +381,9 @@ class Trainer:
         """Exposure of each number's frame, (M,); None where no gains were needed."""
         return self._gain()[batch.frame] if self._has_gains else None
 
-    def _look(self, sampling: kernels.Sampling, rays: dict[str, int], random: np.random.Generator) -> RayJacobian:
-        batch = draw(self.measurements, self.field.shader.columns, rays, random)
-        far_light = self.state.decided is not None
-        return ray_residuals(self.field, batch, batch.per_ray(self.field.view_dependence), self._gain_of(batch), far_light, sampling)
+    def _looks(self, sampling: kernels.Sampling, rays: dict[str, int], count: int, random: np.random.Generator) -> Iterator[RayJacobian]:
+        batches = (draw(self.measurements, self.field.shader.columns, rays, random) for _ in range(count))
+        return ray_residuals(self.field, batches, self._gain_of, self.state.decided is not None, sampling)
 
     def _resize_tables(self, sizes: TableSizes, generator: torch.Generator) -> None:
         kept = self.field.resize_tables(sizes.surface, sizes.radiance, sizes.first, generator)

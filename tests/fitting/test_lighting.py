@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,22 @@ def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
     assert not choice.value and "save 0.0%" in choice.why
 
 
+def test_copies_side_by_side_learn_what_they_would_alone(
+    scene: Scene, use_threads: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer, sampling = _ready(scene)
+    few_looks(monkeypatch, rays=512)
+    found = []
+    for threads in (1, 2):
+        use_threads(threads)
+        random = np.random.default_rng(0)
+        looks = candidates.look_twice(trainer.field, trainer.measurements, sampling, random, None)
+        copies = [(0, True), (3, True), (3, False)]
+        found.append(candidates.errors_of_copies(trainer.field.shader, *looks, copies))
+    for name, alone in found[0].items():
+        assert torch.equal(alone, found[1][name]) and not torch.equal(alone[0], alone[1]) and not torch.equal(alone[1], alone[2])
+
+
 def test_the_modality_that_lamps_save_most_of_decides(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the polarization's error, at the price of a tenth of rgb's: lamps stay, and by what it says."""
     trainer, sampling = _ready(scene)
@@ -133,7 +150,7 @@ def test_the_modality_that_lamps_save_most_of_decides(scene: Scene, monkeypatch:
             of_look[seen.batch.parts["pol"][1]] = 0.9 if mirrors else 1.0
         return out
 
-    monkeypatch.setattr(lighting, "squared_errors", errors)
+    monkeypatch.setattr(candidates, "squared_errors", errors)
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto"})
     choice = decide_light(trainer.field, trainer.measurements, recipe, trainer.needs, sampling, 0, None)
     assert choice.value and "save 10.0% (±0.0%) of pol's error" in choice.why
@@ -150,7 +167,7 @@ def test_few_views_keep_lamps_that_surely_save_anything(scene: Scene, monkeypatc
             noise = [spread * torch.randn(len(seen.usable), generator=random) for seen in judged]
             return [1.0 - saved + of_look - of_look.mean() if mirrors else torch.ones_like(of_look) for of_look in noise]
 
-        monkeypatch.setattr(lighting, "squared_errors", errors)
+        monkeypatch.setattr(candidates, "squared_errors", errors)
         recipe, needs = trainer.recipe.radiance.model_copy(update={"light": "auto"}), replace(trainer.needs, few=few)
         return decide_light(trainer.field, trainer.measurements, recipe, needs, sampling, 0, None).value
 
@@ -161,19 +178,18 @@ def test_few_views_keep_lamps_that_surely_save_anything(scene: Scene, monkeypatc
 def test_views_that_are_held_out_judge_lamps(monkeypatch: pytest.MonkeyPatch) -> None:
     """A trial of the packaged scene: the copies of the shader learn from the other views."""
     scene = load_scene(data_folder("example_scene"), modalities=["rgb"])
-    trainer, looks = Trainer(scene, SMALL.with_changes({"radiance.light": "on"}), 40, None, 0, "cpu"), list[Look]()
+    trainer, looks = Trainer(scene, SMALL.with_changes({"radiance.light": "on"}), 40, None, 0, "cpu"), list[list[Look]]()
 
-    def spied(*args: Any) -> Look:
-        looks.append(look(*args))
-        return looks[-1]
+    def spied(*args: Any) -> tuple[list[Look], list[Look]]:
+        looks.extend(candidates.look_twice(*args))
+        return looks[0], looks[1]
 
-    look = candidates.look
-    monkeypatch.setattr(candidates, "look", spied)
+    monkeypatch.setattr(lighting, "look_twice", spied)
     while trainer.state.light is None:
         trainer.run_step()
     rgb = trainer.measurements["rgb"]
     views_of = lambda some: set(rgb.views[np.concatenate([seen.batch.frame.numpy() for seen in some])].tolist())
-    learned, judged = views_of(looks[: len(looks) // 2]), views_of(looks[len(looks) // 2 :])
+    learned, judged = map(views_of, looks)
     held = set(np.unique(rgb.views)[4::8].tolist())
     assert judged == held and learned == set(rgb.views.tolist()) - held
 

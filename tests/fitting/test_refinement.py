@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -141,10 +142,24 @@ def test_corrections_say_in_the_scenes_frame_where_the_cameras_stand_now(scene: 
 def test_a_look_at_rays_leaves_the_next_step_alone(scene: Scene) -> None:
     trainer = _run(Trainer(scene, _recipe(**{"poses.views": "off", "poses.rig": "off"}), STEPS, None, 0, "cpu"), 0.05)
     sampling = sampling_at(trainer.progress, trainer.recipe, trainer.needs)
-    rows = trainer._look(sampling, dict.fromkeys(trainer.measurements, 50), np.random.default_rng(0))
+    (rows,) = trainer._looks(sampling, dict.fromkeys(trainer.measurements, 50), 1, np.random.default_rng(0))
     assert len(rows.residual) == 150 and bool(torch.isfinite(rows.by_origin).all()) and bool((rows.by_direction != 0).any())
     assert all(p.grad is None or not p.grad.any() for p in trainer.field.parameters())
     assert all(p.requires_grad for p in trainer.field.parameters())
+
+
+def test_looks_side_by_side_are_those_of_one_thread(scene: Scene, use_threads: Callable[[int], None]) -> None:
+    """All that they see, and in their order; drawn, each, after the one before."""
+    trainer = _run(Trainer(scene, _recipe(**{"poses.views": "off", "poses.rig": "off"}), STEPS, None, 0, "cpu"), 0.05)
+    sampling, counts = sampling_at(trainer.progress, trainer.recipe, trainer.needs), dict.fromkeys(trainer.measurements, 50)
+    found = []
+    for threads in (1, 2, 3):
+        use_threads(threads)
+        found.append(list(trainer._looks(sampling, counts, 5, np.random.default_rng(0))))
+    for alone, *others in zip(*found, strict=True):
+        for field in dataclasses.fields(alone):
+            assert all(torch.equal(getattr(alone, field.name), getattr(other, field.name)) for other in others)
+    assert len(found[0]) == 5 and not torch.equal(found[0][0].residual, found[0][1].residual)
 
 
 def test_looks_in_vain_come_ever_later_until_one_says_something(scene: Scene) -> None:
@@ -154,23 +169,24 @@ def test_looks_in_vain_come_ever_later_until_one_says_something(scene: Scene) ->
     rotations = torch.from_numpy(layout.poses[:, :3, :3])[frame]
     signal = 0.0
 
-    def look(_: dict[str, int], random: np.random.Generator) -> poses.RayJacobian:
+    def look(random: np.random.Generator) -> poses.RayJacobian:
         across, ahead = (torch.from_numpy(random.normal(size=(len(frame), 3))) for _ in range(2))
         rows = poses.RayJacobian(frame, torch.zeros(len(frame)), across, 2.0 * across, ahead / ahead.norm(dim=1, keepdim=True))
         noise = 0.1 * torch.from_numpy(random.normal(size=len(frame)))
         return dataclasses.replace(rows, residual=noise + signal * poses.derivative(rows, rotations) @ torch.from_numpy(off))
 
+    look_so_often = lambda _, count, random: [look(random) for _ in range(count)]
     looks = [refinement.recipe.start_at]
     for _ in range(8):
         assert refinement.due(looks[-1]) and not refinement.due(looks[-1] - 1e-6)
-        refinement.step(look, looks[-1])
+        refinement.step(look_so_often, looks[-1])
         looks.append(refinement.next)
     waits = np.diff(looks)
     assert not refinement.motions.views.any() and (np.diff(waits) > 0).all()
     signal = 1.0
     before = refinement.next
     while not refinement.motions.views.any():
-        refinement.step(look, before := refinement.next)
+        refinement.step(look_so_often, before := refinement.next)
     assert refinement.next - before < 0.5 * waits[1]
 
 
