@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from mmsynth import parallel
 from mmsynth.field.kernels.cpu import stores
-from mmsynth.parallel import side_by_side
+from mmsynth.parallel import give_back, side_by_side
 from mmsynth.threads import kernel_threads
 
 
@@ -97,3 +101,18 @@ def test_arrays_that_several_threads_ask_for_have_one_owner_each(threads: int) -
         assert sum(wrong for _, wrong in side_by_side(ask, range(12))) == 0
     finally:
         sys.setswitchinterval(switch)
+
+
+@pytest.mark.skipif(sys.platform != "linux" or platform.libc_ver()[0] != "glibc", reason="glibc alone keeps what was freed")
+def test_what_threads_have_freed_is_given_back(use_threads: Callable[[int], None]) -> None:
+    use_threads(2)
+    resident = lambda: int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
+
+    def kept(_: int) -> np.ndarray:
+        """The last of many blocks, behind which those before it are not at the end of what a thread has."""
+        return [np.ones(8000) for _ in range(500)][-1]  # 32 MB
+
+    last = [block for _, block in side_by_side(kept, range(8))]
+    before = resident()
+    give_back()
+    assert resident() < before - 20 and all(block.all() for block in last)

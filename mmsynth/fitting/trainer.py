@@ -46,6 +46,7 @@ from mmsynth.fitting.smoothness import pairs_at, smooth
 from mmsynth.fitting.stored_frames import OnLoad
 from mmsynth.fitting.table_sizes import TableSizes, size_tables
 from mmsynth.fitting.terms import eikonal, eikonal_points, opacities
+from mmsynth.parallel import give_back
 from mmsynth.scene.scene import Scene, rig_of
 from mmsynth.sensors.metrics import psnr_from_mse
 
@@ -274,6 +275,7 @@ class Trainer:
         settled = state.light_looks, *(x is None for x in (state.tables, state.light, state.decided)), *field.view_dependence.values()
         if settled != self.settled:
             self.settled, self.arranged = settled, None
+            give_back()  # decisions look at many rays at once, steps never do
             if self.on_device is not None:
                 self.on_device.renew()
 
