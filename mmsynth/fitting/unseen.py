@@ -17,11 +17,11 @@ from mmsynth.field.rendering import beginning
 from mmsynth.fitting.measurements import Measurements, Modality, draw
 from mmsynth.fitting.stored_frames import in_threads
 from mmsynth.sensors.camera import Camera, project, unproject
+from mmsynth.threads import kernel_threads
 
 Solid = Callable[[np.ndarray], np.ndarray]  # points (N, 3) of the normalised frame → (N,) bool; called by several threads at once
-_AT_ONCE = 1 << 14  # cells
+_AT_ONCE = 1 << 20  # cells, for each camera
 _POINTS_AT_ONCE = 1 << 11  # on a GPU, of which the definition keeps all corners of all levels, in each thread
-_GROUPS = 8  # of views, for threads
 _RAYS, _RAYS_AT_ONCE = 1 << 17, 1 << 15  # that look for surfaces
 _LEAST_SHARE = 0.05  # of a ray's light, which a surface must give to be met
 _AROUND = 2  # cells around one in which a surface is met, in which it may go on
@@ -86,10 +86,10 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int, sol
     rotations = np.concatenate([m.rotations for m in modalities]).astype(np.float64)
     cameras = [m.cameras[c] for m in modalities for c in m.camera_index]
     views = list(zip(cameras, rotations, origins, begins, strict=True))
-    parts = np.array_split(np.arange(resolution**3), -(-(resolution**3) // _AT_ONCE))
+    parts = np.array_split(np.arange(resolution**3), -(-(resolution**3) * len(origins) // _AT_ONCE))
     before = in_threads(lambda i: _before_cameras(parts[i], resolution, origins, begins), len(parts))
     number, points, size = (np.concatenate(x) for x in zip(*before, strict=True))
-    groups = min(_GROUPS, len(views))
+    groups = min(kernel_threads(), len(views))  # a cell that one of its views has seen is not asked again
     seen = np.any(in_threads(lambda i: _seen_whole(points, size, views[i::groups], solid), groups), axis=0)
     unseen = np.zeros(resolution**3, bool)
     unseen[number[~seen]] = True
@@ -105,10 +105,10 @@ def _before_cameras(number: np.ndarray, resolution: int, origins: np.ndarray, be
     number, cells, contracted = number[outside], cells[outside], contracted[outside, None]
     away = 1.0 / (2.0 - contracted)  # from the centre
     points = cells / contracted * away
-    before = np.zeros(len(points), bool)
-    for origin, begin in zip(origins, begins, strict=True):
-        between = points - origin
-        before |= np.einsum("ni,ni->n", between, between) < begin**2
+    # |p - o|² < b² for some camera, by one product for all cameras: p² + min (o² - b² - 2 p·o) < 0
+    of_cameras = np.vstack([-2.0 * origins.T, np.einsum("ni,ni->n", origins, origins) - begins**2])
+    nearest = (np.hstack([points, np.ones((len(points), 1))]) @ of_cameras).min(1)
+    before = np.einsum("ni,ni->n", points, points) + nearest < 0.0
     # along the radius, where contracted space is stretched most
     return number[before], points[before], np.sqrt(3.0) * 2.0 / resolution * away[before, 0] ** 2
 
@@ -121,15 +121,15 @@ def _seen_whole(
     Args:
         views: camera, rotation (3, 3) and origin (3,) of each, and where its rays begin.
     """
-    seen = np.zeros(len(points), bool)
+    seen, squared = np.zeros(len(points), bool), np.einsum("ni,ni->n", points, points)
     for camera, rotation, origin, begin in views:
-        widest = _widest(camera)
-        # most cells are not before a camera: what is known by the distance along its axis is asked no more
-        asked = np.flatnonzero(~seen & (np.einsum("ni,i->n", points, rotation[:, 2]) - origin @ rotation[:, 2] > widest * begin))
-        local = np.einsum("ni,ij->nj", points[asked] - origin, rotation)
-        away = np.sqrt(np.einsum("ni,ni->n", local, local))
-        kept = (local[:, 2] > widest * away) & (away - size[asked] >= begin)
-        asked, local, away = asked[kept], local[kept], away[kept]
+        widest, left = _widest(camera), np.flatnonzero(~seen)
+        # most cells are not before a camera, as their distances from it and along its axis tell
+        along, apart = (points[left] @ np.stack([rotation[:, 2], -2.0 * origin], 1)).T
+        away = np.sqrt(np.maximum(squared[left] + apart + origin @ origin, 0.0))
+        kept = (along - origin @ rotation[:, 2] > widest * away) & (away - size[left] >= begin)
+        asked, away = left[kept], away[kept]
+        local = (points[asked] - origin) @ rotation
         pixels, margin = project(local, camera), max(camera.fx, camera.fy) * size[asked] / away
         last = np.array([camera.width, camera.height]) - 1.0
         whole = np.minimum(pixels, last - pixels).min(1) > margin  # not where the lens has no pixel: NaN
