@@ -20,7 +20,7 @@ from mmsynth.sensors.camera import Camera, project, unproject
 from mmsynth.threads import kernel_threads
 
 Solid = Callable[[np.ndarray], np.ndarray]  # points (N, 3) of the normalised frame → (N,) bool; called by several threads at once
-_AT_ONCE = 1 << 20  # cells, for each camera
+_AT_ONCE = 1 << 20  # pairs of a cell and a camera
 _POINTS_AT_ONCE = 1 << 11  # on a GPU, of which the definition keeps all corners of all levels, in each thread
 _RAYS, _RAYS_AT_ONCE = 1 << 17, 1 << 15  # that look for surfaces
 _LEAST_SHARE = 0.05  # of a ray's light, which a surface must give to be met
