@@ -288,7 +288,7 @@ def test_cameras_in_their_places_do_not_walk_off(row: Row, scene: Scene) -> None
     frames, away = len(layout.poses), float(np.linalg.norm(layout.poses[:, :3, 3], axis=1).mean())
     equations = []
 
-    def look(_: dict[str, int], random: np.random.Generator) -> RayJacobian:
+    def look(random: np.random.Generator) -> RayJacobian:
         frame = np.repeat(np.arange(frames), 90)
         across, local = random.normal(size=(len(frame), 3)), random.normal(size=(len(frame), 3)) * 0.3 + [0.0, 0.0, 1.0]
         ahead = np.einsum("nij,nj->ni", layout.poses[frame, :3, :3], local / np.linalg.norm(local, axis=1, keepdims=True))
@@ -302,7 +302,7 @@ def test_cameras_in_their_places_do_not_walk_off(row: Row, scene: Scene) -> None
         return float(np.sqrt(np.einsum("vi,vij,vj->v", motions.views, layout.pixels[layout.anchor], motions.views).mean()))
 
     for _ in range(60):
-        refinement.step(look, 0.5)
+        refinement.step(lambda _, count, random: (look(random) for _ in range(count)), 0.5)
     usual = poses.Motions(np.zeros_like(refinement.motions.views), refinement.motions.sensors)
     for found in equations:
         usual = poses.advance(layout, usual, poses.solve(found.of(0, 1), layout, usual, True, False, prior))
