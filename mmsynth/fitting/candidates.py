@@ -97,7 +97,7 @@ def errors_of_copies(
 
 
 def squared_errors(shader: Shader, learned: Sequence[Look], judged: Sequence[Look], degree: int, mirrors: bool) -> list[Tensor]:
-    """Of the numbers of looks, (M,) each, by one copy that has learned on from others."""
+    """Those of the numbers of each look, (M,), by one copy that has learned on from other looks; see ``errors_of_copies``."""
     candidate = copy.deepcopy(shader)
     parameters = dict(candidate.named_parameters())
     optimiser = Adam(parameters, dict.fromkeys(parameters, _RATE))
