@@ -43,7 +43,6 @@ class Look:
         return self.batch.measured.target < self.batch.measured.saturation
 
 
-@torch.no_grad()
 def look(
     field: Field,
     measurements: Measurements,

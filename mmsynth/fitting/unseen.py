@@ -15,7 +15,7 @@ from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.rendering import beginning
 from mmsynth.fitting.measurements import Measurements, Modality, draw
-from mmsynth.fitting.stored_frames import in_threads
+from mmsynth.parallel import side_by_side
 from mmsynth.sensors.camera import Camera, project, unproject
 from mmsynth.threads import kernel_threads
 
@@ -87,10 +87,11 @@ def unseen_before_cameras(modalities: Collection[Modality], resolution: int, sol
     cameras = [m.cameras[c] for m in modalities for c in m.camera_index]
     views = list(zip(cameras, rotations, origins, begins, strict=True))
     parts = np.array_split(np.arange(resolution**3), -(-(resolution**3) * len(origins) // _AT_ONCE))
-    before = in_threads(lambda i: _before_cameras(parts[i], resolution, origins, begins), len(parts))
-    number, points, size = (np.concatenate(x) for x in zip(*before, strict=True))
+    before = side_by_side(lambda part: _before_cameras(part, resolution, origins, begins), parts)
+    number, points, size = (np.concatenate(x) for x in zip(*(found for _, found in before), strict=True))
     groups = min(kernel_threads(), len(views))  # a cell that one of its views has seen is not asked again
-    seen = np.any(in_threads(lambda i: _seen_whole(points, size, views[i::groups], solid), groups), axis=0)
+    by_group = side_by_side(lambda i: _seen_whole(points, size, views[i::groups], solid), range(groups))
+    seen = np.any([found for _, found in by_group], axis=0)
     unseen = np.zeros(resolution**3, bool)
     unseen[number[~seen]] = True
     return unseen.reshape((resolution,) * 3)
