@@ -384,7 +384,9 @@ class Trainer:
         return self._gain()[batch.frame] if self._has_gains else None
 
     def _looks(self, sampling: kernels.Sampling, rays: dict[str, int], count: int, random: np.random.Generator) -> Iterator[RayJacobian]:
-        batches = (draw(self.measurements, self.field.shader.columns, rays, random) for _ in range(count))
+        # what is off has large residuals; drawn evenly, few rays would meet a small object before nothing. Held-out views move, too
+        drawn_from = self.importance.renewed()
+        batches = (draw(self.measurements, self.field.shader.columns, rays, random, drawn_from) for _ in range(count))
         return ray_residuals(self.field, batches, self._gain_of, self.state.decided is not None, sampling)
 
     def _resize_tables(self, sizes: TableSizes, generator: torch.Generator) -> None:
