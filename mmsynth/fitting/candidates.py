@@ -19,7 +19,6 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.measurements import Batch, Measurements, draw
 from mmsynth.fitting.optimiser import Adam
 from mmsynth.parallel import tile_by_tile
@@ -42,6 +41,11 @@ class Look:
         """(M,) which numbers can be judged: clipped ones cannot."""
         return self.batch.measured.target < self.batch.measured.saturation
 
+    @property
+    def weight(self) -> Tensor:
+        """(M,) of each number's ray, as it was drawn more or less often than evenly."""
+        return self.batch.ray_weight[self.batch.measured.ray]
+
 
 def look(
     field: Field,
@@ -62,23 +66,27 @@ def _seen(field: Field, batch: Batch, sampling: kernels.Sampling) -> Look:
 
 
 def look_twice(
-    field: Field, measurements: Measurements, sampling: kernels.Sampling, random: np.random.Generator, held: Tensor | None
+    field: Field,
+    measurements: Measurements,
+    selected: tuple[kernels.Selection, kernels.Selection],
+    sampling: kernels.Sampling,
+    random: np.random.Generator,
 ) -> tuple[list[Look], list[Look]]:
-    """What copies learn from, and what judges them; ``held``: tiles that judge and are not learned from."""
+    """What copies learn from, and what judges them; ``selected``: of which pixels, each."""
 
-    def looks(rays: int, selection: kernels.Selection | None) -> list[Look]:
+    def looks(rays: int, selection: kernels.Selection) -> list[Look]:
         counts = dict.fromkeys(measurements, rays)
         batches = (draw(measurements, field.shader.columns, counts, random, selection) for _ in range(_LOOKS))
         return [seen for _, seen in tile_by_tile(field.device, lambda batch: _seen(field, batch, sampling), batches)]
 
-    learned, judged = selections(measurements, held)
+    learned, judged = selected
     return looks(_RAYS // 2, learned), looks(_RAYS, judged)
 
 
 def errors_of_copies(
     shader: Shader, learned: Sequence[Look], judged: Sequence[Look], copies: Iterable[tuple[int, bool]]
 ) -> dict[str, Tensor]:
-    """Squared errors of copies of the shader that have learned on, side by side, by modality.
+    """Squared errors of copies of the shader that have learned on, side by side, by modality; they count as their rays weigh.
 
     Args:
         copies: degree of the harmonics of the direction that each sees, and whether mirrored light is added to its own.
@@ -89,7 +97,7 @@ def errors_of_copies(
     squared = [errors for _, errors in tile_by_tile(judged[0].batch.origins.device, work, copies)]
     out: dict[str, list[Tensor]] = {name: [] for name in judged[0].batch.parts}
     for seen, *of_look in zip(judged, *squared, strict=True):
-        errors, usable = torch.stack(of_look), seen.usable
+        errors, usable = torch.stack(of_look) * seen.weight, seen.usable
         for name, (_, numbers) in seen.batch.parts.items():
             out[name].append(errors[:, numbers][:, usable[numbers]])
     return {name: torch.cat(parts, 1) for name, parts in out.items()}

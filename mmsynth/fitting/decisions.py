@@ -1,6 +1,6 @@
 """Two questions that residuals answer during a fit: how far radiance depends on direction, and whether exposures differ between frames.
 
-Rays are compared with what was measured, see ``candidates``: of views that are held out, see ``held_out``, and of all for exposures.
+Rays are compared with what was measured, see ``candidates``: of views that are held out, see ``held_out``, and of the others for exposures.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from torch import Tensor
 from mmsynth.field import kernels
 from mmsynth.field.field import Field
 from mmsynth.field.radiance import Shader
-from mmsynth.fitting.candidates import Look, errors_of_copies, look, look_twice
+from mmsynth.fitting.candidates import Look, errors_of_copies, look_twice
 from mmsynth.fitting.choices import Choice, switch
 from mmsynth.fitting.measurements import Measurements
 from mmsynth.fitting.needs import Needs
 from mmsynth.fitting.recipe import RadianceRecipe
 
-_RAYS = 2048  # per modality, that exposures are asked of
 _SURE = 2.0  # standard errors
 
 
@@ -42,21 +41,24 @@ class Decisions:
 def decide(
     field: Field,
     measurements: Measurements,
+    selected: tuple[kernels.Selection, kernels.Selection],
     recipe: RadianceRecipe,
     needs: Needs,
     sampling: kernels.Sampling,
     seed: int,
-    held: Tensor | None,
 ) -> Decisions:
-    """Put the residuals of a field as it is to the tests of this module; ``held``: tiles that it has not learned directions from."""
-    random = np.random.default_rng((seed, 2))
-    judged = look(field, measurements, _RAYS, sampling, random)
+    """Put the residuals of a field as it is to the tests of this module.
+
+    Args:
+        selected: the pixels that it has learned from, and those that it has not learned directions from.
+    """
+    learned, judged = look_twice(field, measurements, selected, sampling, np.random.default_rng((seed, 2)))
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, needs.directions, *look_twice(field, measurements, sampling, random, held))
+        errors = errors_by_degree(field.shader, needs.directions, learned, judged)
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         degrees = dict.fromkeys(measurements, needs.choices["directions"])
-    return Decisions(degrees, _exposure(field, judged, measurements, recipe))
+    return Decisions(degrees, _exposure(field, learned, measurements, recipe))
 
 
 def choose_degrees(errors: dict[str, Tensor], worth: float) -> dict[str, Choice[int]]:
@@ -81,21 +83,32 @@ def _degree(errors: Tensor, degree: int) -> Choice[int]:
 
 
 @torch.no_grad()
-def _exposure(field: Field, judged: Look, measurements: Measurements, recipe: RadianceRecipe) -> Choice[bool]:
-    batch, hits = judged.batch, judged.hits
-    ray = kernels.rays_of(hits.behind, len(hits.share))
-    outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
-    predicted = kernels.predict(outputs, hits.share, batch.measured, hits.behind) + judged.mirrored
+def _exposure(field: Field, looks: Sequence[Look], measurements: Measurements, recipe: RadianceRecipe) -> Choice[bool]:
+    of_looks = [_predicted(field, seen) for seen in looks]
     spreads = {}
-    for name, (_, own) in batch.parts.items():
-        m, kept = measurements[name], judged.usable[own]
-        of_modality = predicted[own][kept] / m.radiance_scale, batch.measured.target[own][kept] / m.radiance_scale, batch.frame[own][kept]
-        spread, noise = exposure_spread(*(x.cpu().numpy() for x in of_modality))
+    for name in looks[0].batch.parts:
+        m = measurements[name]
+        parts = [
+            (predicted[own][kept], seen.batch.measured.target[own][kept], seen.weight[own][kept], seen.batch.frame[own][kept])
+            for seen, predicted in zip(looks, of_looks, strict=True)
+            for own in [seen.batch.parts[name][1]]
+            for kept in [seen.usable[own]]
+        ]
+        predicted, target, weight, frame = (torch.cat(x).cpu().numpy() for x in zip(*parts, strict=True))
+        spread, noise = exposure_spread(predicted / m.radiance_scale, target / m.radiance_scale, weight, frame)
         spreads[name] = spread if spread > 2 * noise / math.sqrt(len(m.origins)) else 0.0
     why = "exposure differs between frames by " + ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
     if recipe.exposure != "auto":
         return switch(recipe.exposure == "on", f"asked for by the recipe; {why}")
     return switch(max(spreads.values()) > recipe.exposure_min_spread, why)
+
+
+def _predicted(field: Field, seen: Look) -> Tensor:
+    """(M,) of each number of a look, by the field as it is."""
+    batch, hits = seen.batch, seen.hits
+    ray = kernels.rays_of(hits.behind, len(hits.share))
+    outputs = field.shader(hits.features, batch.directions[ray], batch.per_ray(field.view_dependence)[ray])
+    return kernels.predict(outputs, hits.share, batch.measured, hits.behind) + seen.mirrored
 
 
 def errors_by_degree(shader: Shader, most: int, learned: Sequence[Look], judged: Sequence[Look]) -> dict[str, Tensor]:
@@ -119,25 +132,26 @@ def degree_needed(errors: Tensor, worth: float) -> int:
     return next((degree for degree in range(len(errors)) if more[degree].mean() <= allowed[degree]), 0)
 
 
-def exposure_spread(predicted: np.ndarray, target: np.ndarray, frame: np.ndarray) -> tuple[float, float]:
+def exposure_spread(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray, frame: np.ndarray) -> tuple[float, float]:
     """Standard deviation of log exposure between frames beyond what noise gives, and the error of one frame's, medians.
 
     Each frame's gain is the least-squares factor between predicted and target.
 
     Args:
-        predicted, target: numbers of one modality that are not clipped, (N,) each, in units of its level. frame: (N,) index.
+        predicted, target: numbers of one modality that are not clipped, (N,) each, in units of its level. weight: (N,) of each
+            in a mean. frame: (N,) index.
     """
     gains, errors = [], []
     for index in np.unique(frame):
         here = frame == index
-        p, t = predicted[here].astype(np.float64), target[here].astype(np.float64)
-        power = float(p @ p)
+        p, t, w = (x[here].astype(np.float64) for x in (predicted, target, weight))
+        power = float(p @ (w * p))
         if here.sum() < 16 or power <= 0:
             continue
-        gain = float(p @ t) / power
+        gain = float(p @ (w * t)) / power
         if gain > 0:
             gains.append(np.log(gain))
-            errors.append(np.sqrt(np.square(p * (t - gain * p)).sum()) / (power * gain))
+            errors.append(np.sqrt(np.square(w * p * (t - gain * p)).sum()) / (power * gain))
     if len(gains) < 2:
         return 0.0, 0.0
     error = float(np.median(errors))

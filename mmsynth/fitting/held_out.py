@@ -35,14 +35,15 @@ def held_out_tiles(measurements: Measurements) -> Tensor | None:
     return out.to(measurements.chosen.pixels.device)
 
 
-def selections(measurements: Measurements, held: Tensor | None) -> tuple[kernels.Selection, kernels.Selection]:
-    """Of the pixels of the views that are learned from, and of those held out; of all pixels of a modality where none is held out."""
-    chosen, first_tile = measurements.chosen, measurements.modalities.first_tile
-    if held is None:
-        return chosen, chosen
-    not_judging = ~held
-    for begin, end in pairwise(first_tile.tolist()):
-        not_judging[begin:end] &= held[begin:end].any()
-    even = Importance(chosen, first_tile, evenly=1.0)
+def selections(importance: Importance, held: Tensor | None) -> tuple[kernels.Selection, kernels.Selection]:
+    """Of the pixels of the views that are learned from, and of those held out; of all pixels of a modality where none is held out.
 
-    return even.renewed(held), even.renewed(not_judging)
+    More of those whose residuals are large: of a small object before nothing, even draws see next to nothing.
+    """
+    if held is None:
+        every = importance.renewed()
+        return every, every
+    not_judging = ~held
+    for begin, end in pairwise(importance.first_tile.tolist()):
+        not_judging[begin:end] &= held[begin:end].any()
+    return importance.renewed(held), importance.renewed(not_judging)

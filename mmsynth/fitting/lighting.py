@@ -83,11 +83,11 @@ def look_for_lamps(field: Field, measurements: Measurements, sampling: kernels.S
 def decide_light(
     field: Field,
     measurements: Measurements,
+    selected: tuple[kernels.Selection, kernels.Selection],
     recipe: RadianceRecipe,
     needs: Needs,
     sampling: kernels.Sampling,
     seed: int,
-    held: Tensor | None,
 ) -> Choice[bool]:
     """Whether the lamps of a field that has learned with them are worth it.
 
@@ -95,14 +95,14 @@ def decide_light(
     save most of: of few full-size views, that is the one behind analysers. They cost time; few views run out before it does, and are given
     lamps that save anything beyond doubt: what the shader paints in their place is wrong between the views.
 
-    ``held``: tiles of the views that judge, see ``held_out``.
+    ``selected``: the pixels that copies learn from, and those that judge, see ``held_out``.
     """
     if recipe.light == "off":
         return switch(False, "asked for by the recipe")
     if not field.shines:
         return switch(False, "from no direction surfaces are brighter than from others")
     random = np.random.default_rng((seed, 10))
-    learned, judged = look_twice(field, measurements, sampling, random, held)
+    learned, judged = look_twice(field, measurements, selected, sampling, random)
     errors = errors_of_copies(field.shader, learned, judged, [(DEGREES, True), (DEGREES, False)])
     of_each = {name: _saved(*own) for name, own in errors.items()}
     modality = max(of_each, key=lambda name: of_each[name][0])
@@ -120,7 +120,8 @@ def _saved(lit: Tensor, unlit: Tensor) -> tuple[float, float]:
     whole = float(unlit.mean()) if len(unlit) else 0.0
     if whole == 0:
         return 0.0, 0.0
-    return 1.0 - float(lit.mean()) / whole, float((unlit - lit).std()) / len(lit) ** 0.5 / whole
+    kept = float(lit.mean()) / whole
+    return 1.0 - kept, float((kept * unlit - lit).std()) / len(lit) ** 0.5 / whole  # of a ratio (Cochran 1977, ch. 6)
 
 
 @torch.no_grad()

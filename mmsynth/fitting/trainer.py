@@ -23,7 +23,7 @@ from mmsynth.field.field import Field
 from mmsynth.fitting.ahead import DrawnStep, ToDraw, drawn_step
 from mmsynth.fitting.choices import Choice
 from mmsynth.fitting.decisions import Decisions, decide
-from mmsynth.fitting.held_out import held_out_tiles
+from mmsynth.fitting.held_out import held_out_tiles, selections
 from mmsynth.fitting.importance import Importance
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.measurements import Batch, Measurements, draw, drawing_of, empty_drawing_of, fingerprint, load_measurements
@@ -258,7 +258,8 @@ class Trainer:
             state.light_looks += 1
             dark = not field.shines
         if state.light is None and (dark or self.progress >= schedule.light_until):
-            state.light = decide_light(field, self.measurements, self.recipe.radiance, self.needs, sampling, self.seed, held)
+            asked = field, self.measurements, selections(self.importance, held), self.recipe.radiance, self.needs, sampling, self.seed
+            state.light = decide_light(*asked)
             self._mirror(state.light)
             look_for_lamps(field, self.measurements, sampling, self.seed)
         if state.decided is None:
@@ -266,7 +267,8 @@ class Trainer:
             seen = 0 if self.progress < schedule.view_dependence_from else DEGREES
             field.view_dependence.update(dict.fromkeys(self.measurements, seen))
             if self.progress >= schedule.decide_at:
-                state.decided = decide(field, self.measurements, self.recipe.radiance, self.needs, sampling, self.seed, held)
+                asked = field, self.measurements, selections(self.importance, held), self.recipe.radiance, self.needs, sampling, self.seed
+                state.decided = decide(*asked)
                 if field.shines:  # by now lamps have found their places
                     keep_bright_lamps(field, self.measurements, sampling, self.seed)
                 self._see_directions(state.decided)

@@ -13,12 +13,12 @@ from mmsynth.fitting.needs import DEGREES
 from mmsynth.scene.scene import Sensor
 
 
-def _frames(gains: np.ndarray, noise: float, per_frame: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Predicted, target and frame."""
+def _frames(gains: np.ndarray, noise: float, per_frame: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Predicted, target, weight and frame."""
     random = np.random.default_rng(0)
     frame = np.repeat(np.arange(len(gains)), per_frame)
     predicted = random.uniform(0.3, 1.5, len(frame))
-    return predicted, gains[frame] * predicted + noise * random.normal(size=len(frame)), frame
+    return predicted, gains[frame] * predicted + noise * random.normal(size=len(frame)), np.ones(len(frame)), frame
 
 
 @pytest.mark.parametrize("spread", [0.03, 0.1, 0.3])
@@ -40,6 +40,16 @@ def test_one_odd_frame_is_no_exposure() -> None:
     gains[7] = 3.0
     found, _ = exposure_spread(*_frames(gains, noise=0.02))
     assert found < 0.01
+
+
+def test_what_is_drawn_more_often_counts_the_less() -> None:
+    """Half of each frame is another thing, wrong in some frames, and drawn nine times as often as the rest."""
+    predicted, target, _, frame = _frames(np.ones(200), noise=0.02)
+    odd = np.arange(len(frame)) % 10 > 0
+    target = np.where(odd, predicted * np.where(frame % 2, 1.2, 1.0), target)
+    (even, _), (weighted, _) = (exposure_spread(predicted, target, w, frame) for w in (np.ones(len(frame)), np.where(odd, 1 / 9, 1.0)))
+    gains = np.log(1 + 0.2 * np.array([0.9, 0.5]))  # of the wrong frames
+    assert even == pytest.approx(1.4826 * gains[0] / 2, rel=0.1) and weighted == pytest.approx(1.4826 * gains[1] / 2, rel=0.1)
 
 
 def _seen(rays: int, harmonic: int, strength: float = 0.5, noise: float = 0.05) -> Look:

@@ -21,6 +21,10 @@ def _measurements(folder: Path, **views: int) -> Measurements:
     return load_measurements(load_scene(write_scene(folder, {name: around(count) for name, count in views.items()})))
 
 
+def _importance(measurements: Measurements) -> Importance:
+    return Importance(measurements.chosen, measurements.modalities.first_tile, 0.5)
+
+
 def _drawn(measurements: Measurements, selection: kernels.Selection) -> dict[str, set[int]]:
     """The views of each modality that 2,000 rays of it come from."""
     batch = draw(measurements, None, dict.fromkeys(measurements, 2000), np.random.default_rng(0), selection)
@@ -36,13 +40,13 @@ def measurements(tmp_path_factory: pytest.TempPathFactory) -> Measurements:
 def test_every_eighth_view_judges_and_the_others_are_learned_from(measurements: Measurements) -> None:
     held = held_out_tiles(measurements)
     assert held is not None
-    learned, judged = selections(measurements, held)
+    where = _importance(measurements)
+    learned, judged = selections(where, held)
     all_views = np.unique(measurements["rgb"].views)
     judges = set(all_views[4::8].tolist())
     assert len(judges) == 2
     assert _drawn(measurements, judged)["rgb"] == judges
     assert _drawn(measurements, learned)["rgb"] == set(all_views.tolist()) - judges
-    where = Importance(measurements.chosen, measurements.modalities.first_tile, 0.5)
     where.residuals[held] = 9.0  # the worst of all
     where.renew(held)
     assert _drawn(measurements, where.selection)["rgb"] == set(all_views.tolist()) - judges
@@ -53,16 +57,26 @@ def test_every_eighth_view_judges_and_the_others_are_learned_from(measurements: 
 def test_a_modality_that_has_none_of_these_views_is_learned_from_and_judged_by_all_it_has(measurements: Measurements) -> None:
     every = set(measurements["nir"].views.tolist())
     assert 1 < len(every) < 4
-    assert all(_drawn(measurements, some)["nir"] == every for some in selections(measurements, held_out_tiles(measurements)))
+    assert all(_drawn(measurements, some)["nir"] == every for some in selections(_importance(measurements), held_out_tiles(measurements)))
 
 
 def test_few_views_are_all_learned_from(tmp_path: Path) -> None:
     measurements = _measurements(tmp_path, rgb=7)
     assert held_out_tiles(measurements) is None
-    assert selections(measurements, None) == (measurements.chosen, measurements.chosen)
+    every = set(measurements["rgb"].views.tolist())
+    assert all(_drawn(measurements, some)["rgb"] == every for some in selections(_importance(measurements), None))
 
 
-def test_rays_of_held_out_views_weigh_as_even_ones_do(measurements: Measurements) -> None:
-    for some in selections(measurements, held_out_tiles(measurements)):
-        batch = draw(measurements, None, {"rgb": 500}, np.random.default_rng(0), some)
-        torch.testing.assert_close(batch.ray_weight, torch.ones(500), atol=1e-5, rtol=0)
+def test_rays_that_decide_go_where_residuals_are_large_and_weigh_the_less(measurements: Measurements) -> None:
+    held, where = held_out_tiles(measurements), _importance(measurements)
+    assert held is not None
+    worst = torch.arange(len(held)) % 4 == 0
+    for residual in (1.0, 9.0):  # alike, and not
+        where.residuals[worst] = residual
+        for some in selections(where, held):
+            batch = draw(measurements, None, {"rgb": 20_000}, np.random.default_rng(0), some)
+            often, weight = float(worst[batch.tile].float().mean()), batch.ray_weight
+            even = float((some.pixels * worst)[: len(some.ends)].sum() / some.pixels.sum())
+            assert float(weight.mean()) == pytest.approx(1.0, abs=0.02)
+            assert float(weight[worst[batch.tile]].sum() / weight.sum()) == pytest.approx(even, abs=0.02)
+            assert often > 1.5 * even if residual > 1.0 else often == pytest.approx(even, abs=0.02)

@@ -16,6 +16,7 @@ from few_looks import few_looks
 from mmsynth.field.storage import load_field
 from mmsynth.fitting import candidates, lighting
 from mmsynth.fitting.candidates import Look
+from mmsynth.fitting.held_out import selections
 from mmsynth.fitting.lighting import decide_light, keep_bright_lamps, look_for_lamps
 from mmsynth.fitting.recipe import Recipe
 from mmsynth.fitting.run import fit
@@ -119,7 +120,7 @@ def test_lamps_that_nothing_mirrors_are_not_needed(scene: Scene) -> None:
         light.second.weight[1:4] = 0.0
         light.second.bias[1:4] = -200.0
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto", "light_min_improvement": 1e-6})
-    choice = decide_light(trainer.field, trainer.measurements, recipe, trainer.needs, sampling, 0, None)
+    choice = decide_light(trainer.field, trainer.measurements, selections(trainer.importance, None), recipe, trainer.needs, sampling, 0)
     assert not choice.value and "save 0.0%" in choice.why
 
 
@@ -132,7 +133,7 @@ def test_copies_side_by_side_learn_what_they_would_alone(
     for threads in (1, 2):
         use_threads(threads)
         random = np.random.default_rng(0)
-        looks = candidates.look_twice(trainer.field, trainer.measurements, sampling, random, None)
+        looks = candidates.look_twice(trainer.field, trainer.measurements, selections(trainer.importance, None), sampling, random)
         copies = [(0, True), (3, True), (3, False)]
         found.append(candidates.errors_of_copies(trainer.field.shader, *looks, copies))
     for name, alone in found[0].items():
@@ -152,7 +153,7 @@ def test_the_modality_that_lamps_save_most_of_decides(scene: Scene, monkeypatch:
 
     monkeypatch.setattr(candidates, "squared_errors", errors)
     recipe = trainer.recipe.radiance.model_copy(update={"light": "auto"})
-    choice = decide_light(trainer.field, trainer.measurements, recipe, trainer.needs, sampling, 0, None)
+    choice = decide_light(trainer.field, trainer.measurements, selections(trainer.importance, None), recipe, trainer.needs, sampling, 0)
     assert choice.value and "save 10.0% (±0.0%) of pol's error" in choice.why
 
 
@@ -169,7 +170,8 @@ def test_few_views_keep_lamps_that_surely_save_anything(scene: Scene, monkeypatc
 
         monkeypatch.setattr(candidates, "squared_errors", errors)
         recipe, needs = trainer.recipe.radiance.model_copy(update={"light": "auto"}), replace(trainer.needs, few=few)
-        return decide_light(trainer.field, trainer.measurements, recipe, needs, sampling, 0, None).value
+        selected = selections(trainer.importance, None)
+        return decide_light(trainer.field, trainer.measurements, selected, recipe, needs, sampling, 0).value
 
     assert decided(0.01, 0.0, few=True) and not decided(0.01, 0.0, few=False)
     assert not decided(0.01, 10.0, few=True) and decided(0.03, 0.0, few=False)
