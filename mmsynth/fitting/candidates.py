@@ -47,16 +47,9 @@ class Look:
         return self.batch.ray_weight[self.batch.measured.ray]
 
 
-def look(
-    field: Field,
-    measurements: Measurements,
-    rays: int,
-    sampling: kernels.Sampling,
-    random: np.random.Generator,
-    selection: kernels.Selection | None = None,
-) -> Look:
-    """So many rays of each modality, as the field renders them; ``selection``: of which pixels, None: of all that are learned from."""
-    return _seen(field, draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, selection), sampling)
+def look(field: Field, measurements: Measurements, rays: int, sampling: kernels.Sampling, random: np.random.Generator) -> Look:
+    """So many rays of each modality, as the field renders them, of all pixels that are learned from alike."""
+    return _seen(field, draw(measurements, field.shader.columns, dict.fromkeys(measurements, rays), random), sampling)
 
 
 @torch.no_grad()
