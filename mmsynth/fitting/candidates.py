@@ -9,7 +9,7 @@ all where they see directions. Many rays judge, too: errors have long tails.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,16 +64,12 @@ def look_twice(
     selected: tuple[kernels.Selection, kernels.Selection],
     sampling: kernels.Sampling,
     random: np.random.Generator,
-) -> tuple[list[Look], list[Look]]:
-    """What copies learn from, and what judges them; ``selected``: of which pixels, each."""
-
-    def looks(rays: int, selection: kernels.Selection) -> list[Look]:
-        counts = dict.fromkeys(measurements, rays)
-        batches = (draw(measurements, field.shader.columns, counts, random, selection) for _ in range(_LOOKS))
-        return [seen for _, seen in tile_by_tile(field.device, lambda batch: _seen(field, batch, sampling), batches)]
-
-    learned, judged = selected
-    return looks(_RAYS // 2, learned), looks(_RAYS, judged)
+) -> Iterator[list[Look]]:
+    """What copies learn from, and then, if it is asked for, what judges them; ``selected``: of which pixels, each."""
+    for rays, selection in zip((_RAYS // 2, _RAYS), selected, strict=True):
+        of_look = measurements, field.shader.columns, dict.fromkeys(measurements, rays), random, selection
+        batches = (draw(*of_look) for _ in range(_LOOKS))
+        yield [seen for _, seen in tile_by_tile(field.device, lambda batch: _seen(field, batch, sampling), batches)]
 
 
 def errors_of_copies(

@@ -52,9 +52,10 @@ def decide(
     Args:
         selected: the pixels that it has learned from, and those that it has not learned directions from.
     """
-    learned, judged = look_twice(field, measurements, selected, sampling, np.random.default_rng((seed, 2)))
+    looks = look_twice(field, measurements, selected, sampling, np.random.default_rng((seed, 2)))
+    learned = next(looks)
     if recipe.view_dependence == "auto":
-        errors = errors_by_degree(field.shader, needs.directions, learned, judged)
+        errors = errors_by_degree(field.shader, needs.directions, learned, next(looks))
         degrees = choose_degrees(errors, recipe.view_dependence_min_improvement)
     else:
         degrees = dict.fromkeys(measurements, needs.choices["directions"])
@@ -84,17 +85,12 @@ def _degree(errors: Tensor, degree: int) -> Choice[int]:
 
 @torch.no_grad()
 def _exposure(field: Field, looks: Sequence[Look], measurements: Measurements, recipe: RadianceRecipe) -> Choice[bool]:
-    of_looks = [_predicted(field, seen) for seen in looks]
+    of_looks = [(_predicted(field, seen), seen.batch.measured.target, seen.weight, seen.batch.frame, seen.usable) for seen in looks]
     spreads = {}
-    for name in looks[0].batch.parts:
+    for name, (_, own) in looks[0].batch.parts.items():  # alike in all looks
         m = measurements[name]
-        parts = [
-            (predicted[own][kept], seen.batch.measured.target[own][kept], seen.weight[own][kept], seen.batch.frame[own][kept])
-            for seen, predicted in zip(looks, of_looks, strict=True)
-            for own in [seen.batch.parts[name][1]]
-            for kept in [seen.usable[own]]
-        ]
-        predicted, target, weight, frame = (torch.cat(x).cpu().numpy() for x in zip(*parts, strict=True))
+        *numbers, usable = (torch.cat([x[own] for x in of_all]).cpu().numpy() for of_all in zip(*of_looks, strict=True))
+        predicted, target, weight, frame = (x[usable] for x in numbers)
         spread, noise = exposure_spread(predicted / m.radiance_scale, target / m.radiance_scale, weight, frame)
         spreads[name] = spread if spread > 2 * noise / math.sqrt(len(m.origins)) else 0.0
     why = "exposure differs between frames by " + ", ".join(f"{n} {s:.1%}" for n, s in spreads.items())
