@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from conftest import look_at
 
+from mmsynth.field.design import Corrections
 from mmsynth.field.field import Field
 from mmsynth.field.kernels import Sampling
 from mmsynth.field.picture import Rendering
@@ -70,6 +71,7 @@ class AnalyticField:
         self.sensors = {s.name: s for s in sensors}
         camera = Camera(24, 18, 26.0, 26.0, 11.3, 8.6, (-0.1, 0.05, 0.001, -0.002))
         self.predicted: list[str] = []
+        self.corrections = Corrections({}, {})
         self.measured = list(self.sensors)
         self.cameras = {s.name: camera for s in sensors}
         self.rig = {s.name: np.eye(4) for s in sensors}

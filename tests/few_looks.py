@@ -12,7 +12,7 @@ def few_looks(monkeypatch: pytest.MonkeyPatch, rays: int = 64) -> None:
     for module, name, number in (
         (candidates, "_STEPS", 2), (candidates, "_LOOKS", 1), (candidates, "_RAYS", rays),
         (lighting, "_RAYS", rays), (measurements, "_TYPICAL", 1024),
-        (needs, "_LOOKED_AT", 256), (refinement, "_AT_ONCE", rays), (refinement, "_DECIDE", 2), (refinement, "_PER_STEP", 2 * rays),
+        (needs, "_LOOKED_AT", 256), (refinement, "AT_ONCE", rays), (refinement, "_DECIDE", 2), (refinement, "_PER_STEP", 2 * rays),
         (refinement, "_PER_VIEW", 1), (trainer, "_MOVE_EVERY", 1), (table_sizes, "_PROBES", 8 * rays),
         (unseen, "_RAYS", 64 * rays), (unseen, "_RAYS_AT_ONCE", 16 * rays),
     ):  # fmt: skip

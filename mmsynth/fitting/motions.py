@@ -211,6 +211,28 @@ def cross_validated_step(
     or take: the field learns from where cameras are put, so what is taken for a signal half of the time makes them walk off. A step
     is shorter the less is sure to be saved, and none where that is less than ``SURE`` standard errors.
     """
+    quadratic, linear = _judged(equations, layout, motions, views, rig, prior)
+    factor = np.clip(-np.linalg.lstsq(quadratic.sum(0), linear.sum(0), rcond=1e-9)[0], 0.0, 1.0)
+    saved = Saved(-(2.0 * linear @ factor + np.einsum("k,fkl,l->f", factor, quadratic, factor)) / float(equations.error.sum()))
+    factor = 2.0 * factor / (1.0 + factor) * (max(0.0, 1.0 - (SURE * saved.unsure / saved.share) ** 2) if saved.share > 0 else 0.0)
+    step = solve(equations.of(0, 1), layout, motions, views, rig, prior)
+    return Motions(factor[0] * step.views, factor[1] * step.sensors), saved
+
+
+def step_of_each_view(equations: NormalEquations, layout: Layout, motions: Motions, prior: float) -> Motions:
+    """The step of ``solve`` of views alone, each as long as the other half of its own rays confirms; see ``cross_validated_step``."""
+    quadratic, linear = _judged(equations, layout, motions, True, False, prior)
+    curved, slope = (_grouped(of_frames, layout.view, len(layout.views)) for of_frames in (quadratic[:, 0, 0], linear[:, 0]))
+    factor = np.clip(np.divide(-slope, curved, out=np.zeros_like(slope), where=curved > 0), 0.0, 1.0)
+    step = solve(equations.of(0, 1), layout, motions, True, False, prior)
+    return Motions((2.0 * factor / (1.0 + factor))[:, None] * step.views, step.sensors)
+
+
+def _judged(
+    equations: NormalEquations, layout: Layout, motions: Motions, views: bool, rig: bool, prior: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the steps of either half change the error of the other, in each frame: aᵀ Q a + 2 l·a, where motions of views and of
+    sensors have factors a; Q (F, 2, 2) and l (F, 2)."""
     now = moved(layout, motions)
     here = _adjoint(now, now[layout.anchor][layout.view])
     quadratic, linear = np.zeros((len(now), 2, 2)), np.zeros((len(now), 2))
@@ -220,11 +242,7 @@ def cross_validated_step(
         judge = equations.of(other)
         quadratic += np.einsum("kfi,fij,lfj->fkl", of_frames, judge.matrix, of_frames)
         linear += np.einsum("kfi,fi->fk", of_frames, judge.vector)
-    factor = np.clip(-np.linalg.lstsq(quadratic.sum(0), linear.sum(0), rcond=1e-9)[0], 0.0, 1.0)
-    saved = Saved(-(2.0 * linear @ factor + np.einsum("k,fkl,l->f", factor, quadratic, factor)) / float(equations.error.sum()))
-    factor = 2.0 * factor / (1.0 + factor) * (max(0.0, 1.0 - (SURE * saved.unsure / saved.share) ** 2) if saved.share > 0 else 0.0)
-    step = solve(equations.of(0, 1), layout, motions, views, rig, prior)
-    return Motions(factor[0] * step.views, factor[1] * step.sensors), saved
+    return quadratic, linear
 
 
 def fix_reference(layout: Layout, step: Motions, views: bool) -> Motions:
@@ -239,6 +257,12 @@ def fix_reference(layout: Layout, step: Motions, views: bool) -> Motions:
     return Motions(step.views + shared[layout.sensor[layout.anchor]] * views, sensors)
 
 
+def follow(motions: Motions, step: Motions) -> Motions:
+    """Motions followed by a step."""
+    parts = (motions.views, step.views), (motions.sensors, step.sensors)
+    return Motions(*(matrix_to_motion(motion_to_matrix(done) @ motion_to_matrix(next_one)) for done, next_one in parts))
+
+
 def advance(layout: Layout, motions: Motions, step: Motions) -> Motions:
     """Motions followed by a step, without the similarity in which all that moved agree.
 
@@ -246,7 +270,8 @@ def advance(layout: Layout, motions: Motions, step: Motions) -> Motions:
     have the one with the least displacement in the pictures (least squares over the region), so that the scene stays in the
     frame of the input, where views are that are not learned from. A view that never moved stays.
     """
-    views = matrix_to_motion(motion_to_matrix(motions.views) @ motion_to_matrix(step.views))
+    followed = follow(motions, step)
+    views = followed.views
     some = np.flatnonzero(np.any(views != 0, axis=1))
     if len(some):
         anchors = layout.poses[layout.anchor[some]]
@@ -259,7 +284,7 @@ def advance(layout: Layout, motions: Motions, step: Motions) -> Motions:
         normal = np.einsum("vai,vab,vbj->ij", similarity, metric, similarity)
         right = np.einsum("vai,vab,vb->i", similarity, metric, views[some])
         views[some] -= similarity @ np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    return Motions(views, matrix_to_motion(motion_to_matrix(motions.sensors) @ motion_to_matrix(step.sensors)))
+    return Motions(views, followed.sensors)
 
 
 def _pixels(poses: np.ndarray, focal: np.ndarray) -> np.ndarray:

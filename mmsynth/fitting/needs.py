@@ -133,7 +133,7 @@ def assess(scene: Scene, measurements: Measurements, recipe: Recipe, seed: int, 
     """
     pixels = sum(m.pixels for m in measurements.values())
     seen = _look_outside(measurements, np.random.default_rng((seed, 7)))
-    facts = _Facts(scene, measurements, recipe, rays_to_come, pixels, _footprint(measurements), *seen)
+    facts = _Facts(scene, measurements, recipe, rays_to_come, pixels, footprint_of(measurements), *seen)
     background = _background(facts)
     far_light = _far_light(facts, background.value)
     resolution = _resolution(facts, background.value)
@@ -324,7 +324,7 @@ def _sooner(rays: float) -> float:
     return min(1.0, max(2 / 3, (rays / (60.0 * _RAYS_PER_SECOND)) ** -0.25))
 
 
-def _footprint(measurements: Measurements) -> float:
+def footprint_of(measurements: Measurements) -> float:
     """Median over frames of a pixel's size at the region's centre, in radii."""
     return float(np.median(np.concatenate([pixel_sizes(m.origins, [m.cameras[c] for c in m.camera_index]) for m in measurements.values()])))
 

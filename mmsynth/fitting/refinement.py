@@ -22,11 +22,11 @@ from mmsynth.fitting.recipe import PosesRecipe
 from mmsynth.parallel import tile_by_tile
 from mmsynth.scene.scene import Scene
 
-_AT_ONCE = 1024  # rays of a batch: all that it goes through is kept for the way back
+AT_ONCE = 1024  # rays of a batch: all that it goes through is kept for the way back
 _DECIDE = 32  # batches at least, by which it is decided
 _PER_STEP, _PER_VIEW = 4096, 64  # rays of a step at least
-_PER_FIT = 400_000  # rays from the beginning to the end of a fit, where each step moves cameras
-_PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
+_PER_FIT, _SHARE = 400_000, 0.1  # rays of a fit's looks, where each moves cameras, or as a share of its own rays: the larger
+PRIOR = 3.0  # footprints that a camera may be off, a standard deviation
 
 Looks = Callable[[dict[str, int], int, np.random.Generator], Iterable[RayJacobian]]
 
@@ -84,10 +84,14 @@ class Refinement:
     ``decided`` is None until the evidence is in. A step sees some rays of every frame and moves the cameras; the field learns on
     from where they are then. What rays said that was not enough for a step (``unsure``) counts in the next, which waits as long as looks
     were in vain.
+
+    Args:
+        footprint: of a pixel, in radii. rays: of the fit, which looks take a share of.
     """
 
-    def __init__(self, scene: Scene, measurements: Measurements, recipe: PosesRecipe, footprint: float, seed: int) -> None:
-        self.measurements, self.recipe, self.prior, self.seed = measurements, recipe, _PRIOR * footprint, seed
+    def __init__(self, scene: Scene, measurements: Measurements, recipe: PosesRecipe, footprint: float, rays: float, seed: int) -> None:
+        self.per_fit = max(_PER_FIT, _SHARE * rays)
+        self.measurements, self.recipe, self.prior, self.seed = measurements, recipe, PRIOR * footprint, seed
         frames = [f for n in measurements.order for f in scene.frames_of(n, scene.split.train)]
         self.region = scene.region
         self.layout = poses.layout_of(frames, tuple(measurements), scene.region)
@@ -116,11 +120,11 @@ class Refinement:
         """
         random = np.random.default_rng((self.seed, 3, self.steps))
         rays = max(_PER_STEP, _PER_VIEW * len(self.layout.views))
-        count = -(-rays // _AT_ONCE) if self.decided is not None else max(_DECIDE, -(-rays // _AT_ONCE))
-        counts = {n: -(-_AT_ONCE * len(m.origins) // len(self.layout.view)) for n, m in self.measurements.items()}
+        count = -(-rays // AT_ONCE) if self.decided is not None else max(_DECIDE, -(-rays // AT_ONCE))
+        counts = {n: -(-AT_ONCE * len(m.origins) // len(self.layout.view)) for n, m in self.measurements.items()}
         equations = poses.normal_equations(looks(counts, count, random), poses.moved(self.layout, self.motions))
         self.steps += 1
-        self.next = progress + rays / _PER_FIT
+        self.next = progress + rays / self.per_fit
         if not np.isfinite(equations.matrix).all() or not equations.error.sum() > 0:
             return  # nothing can be said now
         if self.decided is None:
@@ -133,7 +137,7 @@ class Refinement:
         step, _ = poses.cross_validated_step(equations, self.layout, self.motions, views, rig, self.prior)
         self.unsure = None if step.views.any() or step.sensors.any() else equations
         if self.unsure is not None:  # looks in vain cost as much as others: the more there were, the later the next
-            self.next = progress + max(rays, float(self.unsure.weight.sum())) / _PER_FIT
+            self.next = progress + max(rays, float(self.unsure.weight.sum())) / self.per_fit
             return
         self.motions = poses.advance(self.layout, self.motions, poses.fix_reference(self.layout, step, views))
         self._set_poses()
@@ -157,7 +161,7 @@ class Refinement:
             rig = not views  # one does as well as the other
         why = "motions of {} would save {:.1%} (±{:.1%}) of the error of rays not learned from, and cost {:.0e} rays of the fit"
         of_views, of_rig = (
-            why.format(what, by.share, by.unsure, _PER_FIT) for what, by in (("views", Saved(by_views)), ("sensors", Saved(by_rig)))
+            why.format(what, by.share, by.unsure, self.per_fit) for what, by in (("views", Saved(by_views)), ("sensors", Saved(by_rig)))
         )
         return self._decisions(views, rig, of_views, of_rig)
 

@@ -99,7 +99,8 @@ class Trainer:
         self.of_surface = [n for n in parameters if n.startswith("surface.")]
         self.state = FitState(rays=recipe.sampling.initial_rays, rays_after=recipe.sampling.initial_rays)
         self.task = self._task()  # now: poses are as the input has them
-        self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, seed)
+        looked_at = 0.0 if fused else rays_to_come  # a look costs a GPU launches, and as much as very many rays of a step
+        self.refinement = Refinement(scene, self.measurements, recipe.poses, self.needs.footprint, looked_at, seed)
         self.importance = Importance(self.measurements.chosen, self.measurements.modalities.first_tile, recipe.sampling.evenly)
         self.held = held_out_tiles(self.measurements)
         self.has_opacity = any(m.has_opacity for m in self.measurements.values())

@@ -28,6 +28,8 @@ _COLUMNS = {
     "psnr_view_mean": ("PSNR, mean of dB over views", 2),
     "psnr_foreground": ("PSNR foreground, pooled [dB]", 2),
     "psnr_foreground_view_mean": ("PSNR foreground, mean of dB over views", 2),
+    "psnr_moved": ("PSNR, test cameras moved [dB]", 2),
+    "psnr_foreground_moved": ("PSNR foreground, test cameras moved [dB]", 2),
     "foreground_from": ("foreground from", 0),
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 3),

@@ -16,6 +16,8 @@ _COLUMNS = {
     "psnr_view_mean": "view mean",
     "psnr_foreground": "foreground",
     "psnr_foreground_view_mean": "view mean",
+    "psnr_moved": "moved [dB]",
+    "psnr_foreground_moved": "foreground",
     "ssim": "ssim",
     "lpips": "lpips",
     "psnr_truth": "truth [dB]",
@@ -62,6 +64,9 @@ def score_text(scores: Mapping[str, Any]) -> str:
         lines.append("foreground: within the masks; dB of the error pooled over all views, then view mean: the mean of dB over views")
     if "opacity" in sources:
         lines.append("foreground: the field's own opacity > 0.5, for want of masks; not comparable between fits")
+    if moved := scores.get("moved_px"):
+        off = f"{statistics.fmean(moved.values()):.2f} pixels (mean)"
+        lines.append(f"moved: the fit moved its views; by what those that it did not learn from show, they were off by {off}")
     lines += [f"{key}: {value:.5g}" for key, value in scores.get("geometry", {}).items() if isinstance(value, float)]
     seconds = ", ".join(f"{k} {v:.1f}" for k, v in scores.get("seconds", {}).items() if isinstance(v, (int, float)))
     lines.append(f"seconds: {seconds}; {scores.get('rays_per_s', 0):,.0f} rays/s")

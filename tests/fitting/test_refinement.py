@@ -16,6 +16,7 @@ from mmsynth.field.storage import load_field
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.checkpoint import read_checkpoint
 from mmsynth.fitting.recipe import Recipe
+from mmsynth.fitting.refinement import Refinement
 from mmsynth.fitting.run import fit
 from mmsynth.fitting.schedule import sampling_at
 from mmsynth.fitting.trainer import Trainer
@@ -160,6 +161,20 @@ def test_looks_side_by_side_are_those_of_one_thread(scene: Scene, use_threads: C
         for field in dataclasses.fields(alone):
             assert all(torch.equal(getattr(alone, field.name), getattr(other, field.name)) for other in others)
     assert len(found[0]) == 5 and not torch.equal(found[0][0].residual, found[0][1].residual)
+
+
+def test_looks_of_a_long_fit_take_a_tenth_of_its_rays(scene: Scene) -> None:
+    trainer = Trainer(scene, _recipe(), STEPS, None, 0, "cpu")
+    asked: list[int] = []
+    nothing = lambda rays, count, random: asked.append(count * sum(rays.values())) or []
+    waits = []
+    for rays in (1e5, 1e7):
+        refinement = Refinement(scene, trainer.measurements, trainer.recipe.poses, trainer.needs.footprint, rays, 0)
+        refinement.decided = refinement._decisions(True, False, "", "")
+        refinement.step(nothing, 0.5)
+        waits.append(refinement.next - 0.5)
+    assert asked[0] == asked[1] and asked[1] / waits[1] == pytest.approx(1e6, rel=0.1)
+    assert asked[0] / waits[0] == pytest.approx(4e5, rel=0.1)
 
 
 def test_looks_in_vain_come_ever_later_until_one_says_something(scene: Scene) -> None:

@@ -10,6 +10,8 @@ averaged per view in dB):
   region), and only where there is neither "opacity" (the field's own > 0.5: a field must not choose its own exam, so it says so).
 * ``psnr_foreground_view_mean``: the mean of dB over views, each view's MSE pooled over the pixels of its foreground. Papers on MMS-DATA
   give this one; where views differ it is mostly the higher of the two, as a geometric mean of errors is below the arithmetic one.
+* ``psnr_moved``, ``psnr_foreground_moved``: where the fit moved views, so are those that it did not learn from (see ``placing``), and this
+  is the PSNR at their places then; ``moved_px``: of each of these views how far off it was, pixels.
 * ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
   mosaic per channel.
 * ``lpips``: of Zhang et al. 2018, where a network is installed, see ``perceptual``.
@@ -37,6 +39,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,6 +49,8 @@ from mmsynth.errors import InputError
 from mmsynth.field.picture import Rendering, bands
 from mmsynth.operations.evaluation.parts import PARTS, parts_of
 from mmsynth.operations.evaluation.perceptual import LARGE_ENOUGH, Distance, find_lpips, lpips_of_channels
+from mmsynth.operations.evaluation.placing import place
+from mmsynth.operations.evaluation.scores import Scores
 from mmsynth.operations.evaluation.visible_points import chamfer, seen_points
 from mmsynth.operations.output.progress import Counter, Progress
 from mmsynth.scene.ground_truth import GroundTruth
@@ -71,7 +76,7 @@ def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, 
         views: view ids; None: the scene's test views. progress: called with (rays done, rays in all).
     Returns:
         ``{"modalities": {name: {"psnr", "psnr_foreground", "foreground_from", "ssim", "psnr_truth", ...}}, "geometry": {...},
-        "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON.
+        "views": [...], "seconds": {"render", "total"}, "rays_per_s"}``, ready for JSON; with "moved_px" where the fit moved views.
     Raises:
         InputError: no frame of these views, a sensor with other channels than the field's, a file that cannot be read, or masks that are
             all empty.
@@ -82,11 +87,15 @@ def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, 
     truth = GroundTruth(scene)
     # the pose of gt/aligned and gt/geometry
     at_rgb = [f for f in scene.frames_of("rgb", chosen) if truth.aligned(f.view) or truth.geometry(f.view)]
-    count = Counter(progress, sum(frame.camera.width * frame.camera.height for frame in (*frames, *at_rgb)))
+    unplaced = [f for f in frames if field.corrections.views and f.view not in field.corrections.views]
+    count = Counter(progress, sum(frame.camera.width * frame.camera.height for frame in (*frames, *unplaced, *at_rgb)))
     exam = _Exam(field, scene, truth, count)
     for frame in frames:
         _at_own_pose(exam, frame)
     exam.check_masks(frames)
+    placed = place(field, scene, unplaced)
+    for frame in unplaced:
+        _where_placed(exam, frame, placed.poses[frame.sensor, frame.view])
     for frame in at_rgb:
         _at_rgb_pose(exam, frame)
     return {
@@ -95,7 +104,7 @@ def evaluate(field: Field, scene: Scene, *, views: Sequence[int] | None = None, 
         "views": sorted({frame.view for frame in frames}),
         "seconds": {"render": exam.seconds, "total": time.perf_counter() - began},
         "rays_per_s": exam.rays / max(exam.seconds, 1e-9),
-    }
+    } | ({"moved_px": {str(view): pixels for view, pixels in placed.pixels.items()}} if unplaced else {})
 
 
 def _frames_of(field: Field, scene: Scene, chosen: tuple[int, ...], named: bool) -> list[Frame]:
@@ -121,9 +130,9 @@ class _Exam:
             if sensor.channel_count != ours:
                 raise InputError(f"{scene.root}: '{name}' has {sensor.channel_count} channels, expected the {ours} that the field learned.")
         self.lpips = find_lpips()
-        self.scores = {name: _Scores() for name in names}
-        self.own_pose = {name: _Scores() for name in names}
-        self.geometry = _Scores()
+        self.scores = {name: Scores() for name in names}
+        self.own_pose = {name: Scores() for name in names}
+        self.geometry = Scores()
         self.points: list[np.ndarray] = []
         self.true_points: list[np.ndarray] = []
         self.normal_errors: list[np.ndarray] = []  # degrees
@@ -137,9 +146,11 @@ class _Exam:
                 which = f"this mask of {name} and those of all its other test frames"
                 raise InputError(f"{masked[0].mask}: {which} are empty, expected pixels that are not zero.")
 
-    def render(self, frame: Frame, names: Sequence[str], geometry: bool) -> Rendering:
+    def render(self, frame: Frame, names: Sequence[str], geometry: bool, pose: np.ndarray | None = None) -> Rendering:
+        """As a frame's camera sees the field, from its own pose or from another."""
         started = time.perf_counter()
-        found = self.field.render(frame.camera, self.field.pose_of(frame), names, geometry=geometry, progress=self.count)
+        own = self.field.pose_of(frame) if pose is None else pose
+        found = self.field.render(frame.camera, own, names, geometry=geometry, progress=self.count)
         self.seconds += time.perf_counter() - started
         self.rays += int(found.valid.sum())
         return found
@@ -151,7 +162,7 @@ def _at_own_pose(exam: _Exam, frame: Frame) -> None:
     rendering = exam.render(frame, [sensor.name], False)
     size = rendering.valid.shape
     region = _checked(exam.truth.region(frame), size, f"gt/masks, {sensor.name} view {frame.view}")
-    _score_raw(scores, sensor, frame, rendering, region, exam.masks, exam.lpips)
+    _score_raw(scores, sensor, _compared(sensor, frame, rendering, region, exam.masks), exam.lpips)
     light = _checked(exam.truth.image(frame), (*size, _components(sensor)), f"gt, {sensor.name} view {frame.view}")
     if light is None:
         return
@@ -160,6 +171,16 @@ def _at_own_pose(exam: _Exam, frame: Frame) -> None:
     if region is not None:
         _score_truth(scores, "psnr_truth", sensor, rendering, light, region)
     _score_light(exam.own_pose[sensor.name], sensor, rendering, light, everywhere if region is None else region)
+
+
+def _where_placed(exam: _Exam, frame: Frame, pose: np.ndarray) -> None:
+    """A frame's sensor against the frame, from where it saw what it shows."""
+    sensor, scores = exam.sensors[frame.sensor], exam.scores[frame.sensor]
+    rendering = exam.render(frame, [sensor.name], False, pose)
+    found = _compared(sensor, frame, rendering, exam.truth.region(frame), exam.masks)
+    scores.add("psnr_moved", found.squared[found.valid])
+    for source, inside in found.foreground.items():
+        scores.add(f"psnr_foreground_moved/{source}", found.squared[found.valid & inside])
 
 
 def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
@@ -196,41 +217,6 @@ def _components(sensor: Sensor) -> int:
     return 3 if sensor.is_polarization else sensor.channel_count
 
 
-class _Mean:
-    """Running weighted mean; None when nothing was added."""
-
-    def __init__(self) -> None:
-        self.total = self.weight = 0.0
-
-    def add(self, values: np.ndarray, weights: np.ndarray | None = None) -> None:
-        good = np.isfinite(values) if weights is None else np.isfinite(values) & np.isfinite(weights)
-        known = values[good]
-        self.total += float((known if weights is None else known * weights[good].astype(np.float64)).sum(dtype=np.float64))
-        self.weight += float(good.sum() if weights is None else weights[good].sum(dtype=np.float64))
-
-    @property
-    def value(self) -> float | None:
-        return self.total / self.weight if self.weight > 0 else None
-
-
-class _Scores:
-    """Named means of one modality; which of them become dB or a root is decided once, at the end."""
-
-    def __init__(self) -> None:
-        self.means: dict[str, _Mean] = {}
-
-    def add(self, key: str, values: np.ndarray, weights: np.ndarray | None = None) -> None:
-        self.means.setdefault(key, _Mean()).add(values, weights)
-
-    def value(self, key: str) -> float | None:
-        mean = self.means[key].value if key in self.means else None
-        if mean is None:
-            return None
-        if key.startswith("psnr"):
-            return psnr_from_mse(mean)
-        return float(np.sqrt(mean)) if key.endswith("_rmse") else mean
-
-
 def raw_ssim(measured: np.ndarray, predicted: np.ndarray, valid: np.ndarray, sensor: Sensor) -> list[float]:
     """SSIM of each mosaic sub-frame (or of each channel of a frame without mosaic)."""
     if sensor.mosaic is None:
@@ -248,16 +234,22 @@ def _checked(truth: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.
     return truth
 
 
-def _score_raw(
-    scores: _Scores,
-    sensor: Sensor,
-    frame: Frame,
-    rendering: Rendering,
-    region: np.ndarray | None,
-    masks: MaskMeaning,
-    lpips: Distance | None,
-) -> None:
-    """Against the frame as the sensor recorded it."""
+@dataclass(frozen=True)
+class _Compared:
+    """What a sensor recorded, and what is predicted for it, both (H, W) of a mosaic, else (H, W, C); masks are (H, W).
+
+    Attributes:
+        squared: errors, as ``measured``. valid: the pixels that count. foreground: what is known of it, by source.
+    """
+
+    measured: np.ndarray
+    predicted: np.ndarray
+    squared: np.ndarray
+    valid: np.ndarray
+    foreground: dict[str, np.ndarray]
+
+
+def _compared(sensor: Sensor, frame: Frame, rendering: Rendering, region: np.ndarray | None, masks: MaskMeaning) -> _Compared:
     measured, alpha = load_frame(sensor, frame)
     channels = rendering.channels[sensor.name]
     mask, valid = read_mask(frame), rendering.valid
@@ -269,19 +261,24 @@ def _score_raw(
     if mask is not None and masks == "ignore":
         valid = valid & mask
     predicted = np.clip(np.nan_to_num(channels if sensor.mosaic is None else photosites_of(channels, sensor.mosaic)), 0.0, 1.0)
-    squared = (predicted - measured) ** 2
     if mask is None and alpha is not None:
         mask = alpha > 0.5
     foreground = {"masks": mask, "gt": region, "opacity": rendering.opacity > 0.5}
+    known = {source: inside for source, inside in foreground.items() if inside is not None}
+    return _Compared(measured, predicted, (predicted - measured) ** 2, valid, known)
+
+
+def _score_raw(scores: Scores, sensor: Sensor, found: _Compared, lpips: Distance | None) -> None:
+    """Against the frame as the sensor recorded it."""
+    predicted, squared, valid = found.predicted, found.squared, found.valid
     scores.add("psnr", squared[valid])
     if valid.any():
         scores.add("view_mean", _decibels(squared[valid]))
-    for source, inside in foreground.items():
-        if inside is not None:
-            scores.add(f"psnr_foreground/{source}", squared[valid & inside])
-            if (valid & inside).any():
-                scores.add(f"view_mean/{source}", _decibels(squared[valid & inside]))
-    measured = np.clip(measured, 0.0, 1.0)
+    for source, inside in found.foreground.items():
+        scores.add(f"psnr_foreground/{source}", squared[valid & inside])
+        if (valid & inside).any():
+            scores.add(f"view_mean/{source}", _decibels(squared[valid & inside]))
+    measured = np.clip(found.measured, 0.0, 1.0)
     scores.add("ssim", np.array(raw_ssim(measured, predicted, valid, sensor)))
     if lpips is not None and min(valid.shape) >= LARGE_ENOUGH:
         # both demosaicked alike: networks have no eyes for a mosaic
@@ -294,7 +291,7 @@ def _decibels(squared: np.ndarray) -> np.ndarray:
     return np.array(psnr_from_mse(float(squared.mean(dtype=np.float64))))
 
 
-def _score_truth(scores: _Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
+def _score_truth(scores: Scores, key: str, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """All channels against noise-free light; truth (H, W, C), of a polarization sensor Stokes (H, W, 3)."""
     for seen, light, here in _by_bands(rendering, truth, where):
         difference = np.clip(seen.channels[sensor.name], 0.0, 1.0) - np.clip(_channels(light, sensor), 0.0, 1.0)
@@ -315,7 +312,7 @@ def _channels(light: np.ndarray, sensor: Sensor) -> np.ndarray:
     return stokes_to_intensities(torch.from_numpy(light), sensor.polarizer_angles_deg).numpy()
 
 
-def _score_prediction(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
+def _score_prediction(scores: Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """What is asked of a modality that was not measured: how good it is but for its gain, and whether it knows how good it is."""
     for seen, light, here in _by_bands(rendering, truth, where):
         values, real_values = seen.channels[sensor.name][here], _channels(light, sensor)[here]
@@ -325,7 +322,7 @@ def _score_prediction(scores: _Scores, sensor: Sensor, rendering: Rendering, tru
         scores.add("within_2sd", np.abs(values - real_values) < 2.0 * seen.deviation[sensor.name][here])
 
 
-def _score_light(scores: _Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
+def _score_light(scores: Scores, sensor: Sensor, rendering: Rendering, truth: np.ndarray, where: np.ndarray) -> None:
     """Errors that PSNR does not show: the shape of the spectrum, the polarization."""
     for seen, light, here in _by_bands(rendering, truth, where):
         if sensor.is_polarization:
@@ -360,12 +357,12 @@ def _geometry(exam: _Exam) -> dict[str, float]:
     return out | ({"normal_mae_deg": float(errors.mean()), "normal_median_deg": float(np.median(errors))} if len(errors) else {})
 
 
-def _values(scores: _Scores, keys: Sequence[str]) -> dict[str, Any]:
+def _values(scores: Scores, keys: Sequence[str]) -> dict[str, Any]:
     found = {key: scores.value(key) for key in keys}
     return {key: value for key, value in found.items() if value is not None}
 
 
-def _prediction(scores: _Scores) -> dict[str, Any]:
+def _prediction(scores: Scores) -> dict[str, Any]:
     """Of a predicted modality: PSNR with the one gain that suits best, that gain, and how often the error is below two deviations."""
     ours, both, true = (scores.value(f"gain/{key}") for key in ("ours_ours", "ours_true", "true_true"))
     within = scores.value("within_2sd")
@@ -375,7 +372,7 @@ def _prediction(scores: _Scores) -> dict[str, Any]:
     return {"predicted": True, "psnr_aligned_free_gain": psnr_from_mse(mse), "free_gain": both / ours, "within_2sd": within}
 
 
-def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
+def _summary(scores: Scores, own_pose: Scores) -> dict[str, Any]:
     """The keys of one modality in the order of the module docstring."""
     out = _values(scores, ("psnr",))
     if "view_mean" in scores.means:
@@ -384,6 +381,8 @@ def _summary(scores: _Scores, own_pose: _Scores) -> dict[str, Any]:
         value = scores.value(f"psnr_foreground/{source}")
         if value is not None:
             out |= {"psnr_foreground": value, "psnr_foreground_view_mean": scores.value(f"view_mean/{source}"), "foreground_from": source}
+            moved = {"psnr_moved": scores.value("psnr_moved"), "psnr_foreground_moved": scores.value(f"psnr_foreground_moved/{source}")}
+            out |= {key: value for key, value in moved.items() if value is not None}
             break
     out |= _values(scores, ("ssim", "lpips", "psnr_truth", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS)))
     out |= _prediction(scores)

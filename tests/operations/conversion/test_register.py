@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 import pytest
-import torch
 from analytic import MONO, RGB, ring_pose
 from conftest import look_at
+from painted_ball import CAMERA, painted_ball, raw_of, scene_of_ball
 from scipy.ndimage import map_coordinates
 
 from mmsynth.errors import InputError
-from mmsynth.field.design import Design
 from mmsynth.field.field import Field
 from mmsynth.operations.conversion.files import convert_files
 from mmsynth.operations.conversion.register import Landmarks, landmarks, register
@@ -23,39 +22,16 @@ from mmsynth.scene.image_writers import write_png16
 from mmsynth.scene.motion import matrix_to_motion, motion_to_matrix
 from mmsynth.scene.scene import Frame, Region, Scene, Split
 from mmsynth.sensors.camera import Camera, project, ray_map
-from mmsynth.sensors.mosaic import mosaic
-
-CAMERA = Camera(160, 120, 170.0, 170.0, 79.2, 59.8, (-0.08, 0.02, 0.001, -0.001))
 
 
 @pytest.fixture(scope="module")
 def field() -> Field:
-    """A ball with fine random paint: what a field of hash grids is before it has learned anything, with more in its tables."""
-    torch.manual_seed(0)
-    design = Design(surface_levels=2, radiance_levels=4, surface_finest=8, radiance_finest=48, coarsest=6, occupancy=16, initial_radius=0.7)
-    made = Field(design, {"rgb": RGB}, {"rgb": 0.4}, Region((0.0, 0.0, 0.0), 1.0), cameras={"rgb": CAMERA}, rig={"rgb": np.eye(4)})
-    with torch.no_grad():
-        made.appearance.table.normal_(std=1.0)
-        for p in made.shader.parameters():
-            p.mul_(2.0)
-    made.sampling = type(made.sampling)(400.0, 0.005, 2, 4)
-    return made
-
-
-def _raw(field: Field, pose: np.ndarray, seed: int) -> np.ndarray:
-    image = np.nan_to_num(field.render(CAMERA, pose, geometry=False).channels["rgb"])
-    raw = mosaic(torch.from_numpy(image).movedim(-1, 0), RGB.mosaic).numpy()  # type: ignore[arg-type]
-    return np.clip(raw + 0.004 * np.random.default_rng(seed).normal(size=raw.shape), 0, 1).astype(np.float32)
+    return painted_ball(RGB)
 
 
 @pytest.fixture(scope="module")
 def scene(field: Field, tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    folder, frames = tmp_path_factory.mktemp("frames"), []
-    for view in range(12):
-        path = folder / f"{view:04d}.png"
-        write_png16(path, _raw(field, ring_pose(view, 12), view))
-        frames.append(Frame("rgb", view, path, CAMERA, ring_pose(view, 12)))
-    return Scene(folder, "test", {"rgb": RGB}, tuple(frames), field.region, Split(tuple(range(11)), (11,), "test"), "m")
+    return scene_of_ball(field, tmp_path_factory.mktemp("frames"), 11, 1)
 
 
 def test_a_frame_is_found_to_a_fraction_of_a_pixel(field: Field, scene: Scene) -> None:
@@ -64,7 +40,7 @@ def test_a_frame_is_found_to_a_fraction_of_a_pixel(field: Field, scene: Scene) -
     known = landmarks(field, scene, "rgb")
     for exposure in (1.0, 0.5):
         pose = ring_pose(1, 24) @ motion_to_matrix(np.r_[random.normal(0, 0.05, 3), 0.02, -0.03, 0.25][None])[0]
-        found = register(field, known, (exposure * _raw(field, pose, 99)).astype(np.float32), CAMERA, "rgb")
+        found = register(field, known, (exposure * raw_of(field, pose, 99)).astype(np.float32), CAMERA, "rgb")
         points = 0.7 * np.array([[0.0, 0.0, 0.0], *np.eye(3), *-np.eye(3)])
         shown = [project((points - p[:3, 3]) @ p[:3, :3], CAMERA) for p in (pose, found.pose)]
         assert np.nanmax(np.linalg.norm(shown[0] - shown[1], axis=1)) < 0.2
@@ -124,7 +100,7 @@ def test_a_frame_of_something_else_is_refused(field: Field, scene: Scene, what: 
 
 def test_images_without_a_pose_are_converted(field: Field, scene: Scene, tmp_path: Path) -> None:
     pose = ring_pose(3, 24)
-    write_png16(tmp_path / "photo.png", _raw(field, pose, 5))
+    write_png16(tmp_path / "photo.png", raw_of(field, pose, 5))
     convert_files(field, scene, tmp_path / "out", source="rgb", target="rgb", images=[tmp_path / "photo.png"])
     facts: dict[str, Any] = json.loads((tmp_path / "out/rgb/photo.json").read_text())
     np.testing.assert_allclose(facts["camera"]["camera_to_world"], pose, atol=2e-3)
