@@ -17,6 +17,7 @@ from mmsynth.report.page import links_to, svg, write_page
 from mmsynth.report.pictures import Picture, Row, encode_rows
 from mmsynth.report.run_pictures import measured_channels as measured_channels
 from mmsynth.report.run_pictures import picture_rows
+from mmsynth.report.text import moved_text
 from mmsynth.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -174,6 +175,8 @@ def _score_note(evaluation: Mapping[str, Any], unit: str) -> str:
             "chamfer_visible": f"Chamfer {{:.4g}} {unit}",
         }
         parts.append("Geometry: " + ", ".join(text.format(geometry[key]) for key, text in labels.items() if key in geometry) + ".")
+    if moved := evaluation.get("moved_px"):
+        parts.append(f"Moved: {moved_text(moved)}.")
     if "rays_per_s" in evaluation:
         parts.append(f"Rendered at {evaluation['rays_per_s']:,.0f} rays/s.")
     return " ".join(parts)

@@ -65,12 +65,17 @@ def score_text(scores: Mapping[str, Any]) -> str:
     if "opacity" in sources:
         lines.append("foreground: the field's own opacity > 0.5, for want of masks; not comparable between fits")
     if moved := scores.get("moved_px"):
-        off = f"{statistics.fmean(moved.values()):.2f} pixels (mean)"
-        lines.append(f"moved: the fit moved its views; by what those that it did not learn from show, they were off by {off}")
+        lines.append(f"moved: {moved_text(moved)}")
     lines += [f"{key}: {value:.5g}" for key, value in scores.get("geometry", {}).items() if isinstance(value, float)]
     seconds = ", ".join(f"{k} {v:.1f}" for k, v in scores.get("seconds", {}).items() if isinstance(v, (int, float)))
     lines.append(f"seconds: {seconds}; {scores.get('rays_per_s', 0):,.0f} rays/s")
     return "\n".join(lines)
+
+
+def moved_text(pixels: Mapping[str, float]) -> str:
+    """What ``psnr_moved`` is, by ``moved_px``."""
+    off = statistics.fmean(pixels.values())
+    return f"the fit moved its views; those that it did not learn from are off by {off:.2f} pixels (mean), by what their frames show"
 
 
 def conversion_text(found: Sequence[Mapping[str, Any]]) -> str:

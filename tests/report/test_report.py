@@ -56,13 +56,13 @@ def test_report(tmp_path: Path) -> None:
     field.wrong = False
     scene = scene_of(field, tmp_path / "scene")
     field.wrong, field.manifest = True, MANIFEST
-    evaluation = evaluate(field, scene)  # type: ignore[arg-type]
+    evaluation = evaluate(field, scene) | {"moved_px": {"3": 0.5}}  # type: ignore[arg-type]
     (tmp_path / "field.safetensors").write_bytes(b"0" * 2500)
     (tmp_path / "mesh of it.ply").write_text("ply")
     path = write_run_report(tmp_path, field, evaluation=evaluation, train_log=LOG, scene=scene)  # type: ignore[arg-type]
     page = check(path)
     assert "&lt;nothing&gt;" in page.source and "<nothing>" not in page.source
-    for text in ("PSNR [dB]", "spectral angle", "depth error", "<svg", "Test views: 3."):
+    for text in ("PSNR [dB]", "spectral angle", "depth error", "<svg", "Test views: 3.", "off by 0.50 pixels"):
         assert text in page.source
     assert page.table("what was decided and why") == [
         ["choice", "value", "why"],
