@@ -81,6 +81,11 @@ class NormalEquations:
         return NormalEquations(*(a + b for a, b in zip(self.parts, others.parts, strict=True)))
 
     @property
+    def usable(self) -> bool:
+        """Whether anything can be said by them."""
+        return bool(np.isfinite(self.matrix).all()) and float(self.error.sum()) > 0
+
+    @property
     def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return self.matrix, self.vector, self.error, self.weight
 

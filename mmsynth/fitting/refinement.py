@@ -78,6 +78,20 @@ def _residuals(field: Field, batch: Batch, gain: Tensor | None, far_light: bool,
     return RayJacobian(frame.cpu(), *(x.detach().cpu().double() for x in (mean, *gradients, batch.directions)))
 
 
+def rays_of_batch(measurements: Measurements) -> dict[str, int]:
+    """``AT_ONCE`` rays, or a few more: of each modality as many as it has frames."""
+    frames = sum(len(m.origins) for m in measurements.values())
+    return {n: -(-AT_ONCE * len(m.origins) // frames) for n, m in measurements.items()}
+
+
+def put(measurements: Measurements, layout: poses.Layout, motions: Motions) -> np.ndarray:
+    """Let frames be where motions of their views and sensors put them: (F, 4, 4), see ``motions.moved``."""
+    now = poses.moved(layout, motions)
+    for s, name in enumerate(layout.sensors):
+        measurements.set_poses(name, now[layout.sensor == s])
+    return now
+
+
 class Refinement:
     """Motions of views and sensors, and whether they have any.
 
@@ -121,12 +135,11 @@ class Refinement:
         random = np.random.default_rng((self.seed, 3, self.steps))
         rays = max(_PER_STEP, _PER_VIEW * len(self.layout.views))
         count = -(-rays // AT_ONCE) if self.decided is not None else max(_DECIDE, -(-rays // AT_ONCE))
-        counts = {n: -(-AT_ONCE * len(m.origins) // len(self.layout.view)) for n, m in self.measurements.items()}
-        equations = poses.normal_equations(looks(counts, count, random), poses.moved(self.layout, self.motions))
+        equations = poses.normal_equations(looks(rays_of_batch(self.measurements), count, random), poses.moved(self.layout, self.motions))
         self.steps += 1
         self.next = progress + rays / self.per_fit
-        if not np.isfinite(equations.matrix).all() or not equations.error.sum() > 0:
-            return  # nothing can be said now
+        if not equations.usable:
+            return
         if self.decided is None:
             self.decided = self._decide(equations)
         if not self.decided.any:
@@ -140,7 +153,7 @@ class Refinement:
             self.next = progress + max(rays, float(self.unsure.weight.sum())) / self.per_fit
             return
         self.motions = poses.advance(self.layout, self.motions, poses.fix_reference(self.layout, step, views))
-        self._set_poses()
+        put(self.measurements, self.layout, self.motions)
 
     def _decide(self, equations: NormalEquations) -> MotionDecisions:
         """By the share of the error of rays not learned from that motions of views save beyond those of sensors, and the reverse."""
@@ -179,11 +192,6 @@ class Refinement:
             decision(self.recipe.views, self.views_can, views, of_views if self.views_can else "there is one view"),
             decision(self.recipe.rig, self.rig_can, rig, of_rig if self.rig_can else "no two sensors share views"),
         )
-
-    def _set_poses(self) -> None:
-        now = poses.moved(self.layout, self.motions)
-        for s, name in enumerate(self.layout.sensors):
-            self.measurements.set_poses(name, now[self.layout.sensor == s])
 
     def corrections(self) -> Corrections:
         """The motions in the scene's frame and unit; those of sensors and views that have none are left out."""
@@ -224,4 +232,4 @@ class Refinement:
         self.unsure = None if state["unsure"] is None else NormalEquations(*(part.numpy() for part in state["unsure"]))
         self.steps, self.next = state["steps"], state["next"]
         if self.steps:
-            self._set_poses()
+            put(self.measurements, self.layout, self.motions)

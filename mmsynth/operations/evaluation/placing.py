@@ -16,7 +16,7 @@ import torch
 from mmsynth.fitting import motions as poses
 from mmsynth.fitting.measurements import draw, measure
 from mmsynth.fitting.needs import footprint_of
-from mmsynth.fitting.refinement import AT_ONCE, PRIOR, ray_residuals
+from mmsynth.fitting.refinement import AT_ONCE, PRIOR, put, ray_residuals, rays_of_batch
 from mmsynth.scene.scene import Frame, Scene
 
 if TYPE_CHECKING:
@@ -53,17 +53,14 @@ def place(field: Field, scene: Scene, frames: Sequence[Frame]) -> Placed:
     layout = poses.layout_of(listed, measurements.order, scene.region)
     motions = poses.Motions(np.zeros((len(layout.views), 6)), np.zeros((len(layout.sensors), 6)))
     prior = PRIOR * footprint_of(measurements)
-    counts = {n: -(-AT_ONCE * len(m.origins) // len(listed)) for n, m in measurements.items()}
-    random = np.random.default_rng(0)
+    counts, random = rays_of_batch(measurements), np.random.default_rng(0)
     for _ in range(_LOOKS):
-        now = poses.moved(layout, motions)
-        for s, name in enumerate(layout.sensors):
-            measurements.set_poses(name, now[layout.sensor == s])
+        now = put(measurements, layout, motions)
         batches = (draw(measurements, field.shader.columns, counts, random) for _ in range(-(-_PER_FRAME * len(listed) // AT_ONCE)))
         seen = ray_residuals(field, batches, lambda batch: None, field.far_light is not None, field.sampling)
         equations = poses.normal_equations(seen, now)
-        if not np.isfinite(equations.matrix).all() or not equations.error.sum() > 0:
-            break  # nothing can be said
+        if not equations.usable:
+            break
         step = poses.step_of_each_view(equations, layout, motions, prior)
         motions = poses.follow(motions, step)
         if _pixels(layout, step).max() < _SMALL:
