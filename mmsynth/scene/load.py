@@ -16,7 +16,7 @@ from mmsynth.files import read_json
 from mmsynth.scene.also import stated_source, with_sensors
 from mmsynth.scene.checks import rigid_pose
 from mmsynth.scene.layouts.blender import SPLITS, file_of, read_blender
-from mmsynth.scene.layouts.colmap import models_in, read_colmap, read_colmap_points
+from mmsynth.scene.layouts.colmap import halves_in, models_in, read_colmap, read_colmap_points
 from mmsynth.scene.layouts.colmap_model import read_model_poses
 from mmsynth.scene.layouts.middlebury import read_middlebury
 from mmsynth.scene.layouts.mmsdata import read_mmsdata, read_mmsdata_points, read_reference_poses
@@ -151,6 +151,8 @@ def _read(source: SceneSource, modalities: Sequence[str] | None) -> Scene:
     held = [name for name, reader in _READERS.items() if reader.is_in(path)]
     if not held and (path / "calibration.json").is_file():
         raise InputError(f"{path}: calibration.json without meta_data.json is an MMS-DATA source scene, which has no camera poses.")
+    if not held and (halves := halves_in(path)):
+        raise InputError(halves[0])
     if not held:
         known = ", ".join(f"{reader.marks} ({name})" for name, reader in _READERS.items())
         raise InputError(f"{path}: not a scene, expected {known}.")

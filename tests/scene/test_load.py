@@ -83,6 +83,22 @@ def test_missing_and_unknown_folders(tmp_path: Path) -> None:
         load_scene(tmp_path / "a.txt")
 
 
+@pytest.mark.parametrize(
+    ("files", "says"),
+    [
+        (["sparse/0/cameras.bin", "sparse/0/points3D.bin"], r"sparse/0: a COLMAP model's cameras.bin without images.bin, expected both"),
+        (["sparse/images.txt"], r"sparse: a COLMAP model's images.txt without cameras.txt"),
+        (["sparse/0/cameras.bin", "sparse/0/images.txt"], r"cameras.bin without images.bin"),
+    ],
+)
+def test_half_a_colmap_model(files: list[str], says: str, tmp_path: Path) -> None:
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_bytes(b"")
+    with pytest.raises(InputError, match=says):
+        load_scene(tmp_path)
+
+
 def test_modalities_by_name_or_alias(write_mmsdata: Writer) -> None:
     root = write_mmsdata()
     assert list(load_scene(root, modalities=["infrared"]).sensors) == list(load_scene(root, modalities=["NIR"]).sensors) == ["nir"]

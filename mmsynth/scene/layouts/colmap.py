@@ -28,7 +28,7 @@ from mmsynth.files import read_json, read_text
 from mmsynth.scene.checks import is_file
 from mmsynth.scene.images import SUFFIXES, read_native
 from mmsynth.scene.known_sensors import make_sensor, wanted_modalities
-from mmsynth.scene.layouts.colmap_model import ModelImage, is_model, read_model, read_points
+from mmsynth.scene.layouts.colmap_model import ModelImage, is_model, missing_of_model, read_model, read_points
 from mmsynth.scene.layouts.pictures import Pictures, Resizes
 from mmsynth.scene.points import SparsePoints
 from mmsynth.scene.region import region_from_cameras, region_from_points, stated_region
@@ -42,7 +42,17 @@ _SAME_ROTATION = 3.0  # degrees, median: what reconstructions of a rig leave
 
 def models_in(root: Path) -> list[Path]:
     """Folders with a model, in the order in which they are preferred."""
-    return [folder for place in _PLACES for folder in (sorted(root.glob(place)) if place != "." else [root]) if is_model(folder)]
+    return [folder for folder in _places_in(root) if is_model(folder)]
+
+
+def halves_in(root: Path) -> list[str]:
+    """What folders lack that hold a part of a model, a sentence of each."""
+    found = ((folder, missing_of_model(folder)) for folder in _places_in(root))
+    return [f"{folder}: a COLMAP model's {missing}, expected both." for folder, missing in found if missing]
+
+
+def _places_in(root: Path) -> list[Path]:
+    return [folder for place in _PLACES for folder in (sorted(root.glob(place)) if place != "." else [root])]
 
 
 def read_colmap(root: Path, modalities: Sequence[str] | None = None, images: Path | None = None) -> Scene:

@@ -66,6 +66,15 @@ def is_model(folder: Path) -> bool:
     return any((folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
+def missing_of_model(folder: Path) -> str | None:
+    """What a folder lacks that holds one of the two files of a model; None where it has both, or neither."""
+    held = [path.name for stem in ("cameras", "images") for suffix in (".bin", ".txt") if (path := folder / f"{stem}{suffix}").is_file()]
+    if not held or is_model(folder):
+        return None
+    other = {"cameras": "images", "images": "cameras"}
+    return f"{held[0]} without {other[Path(held[0]).stem]}{Path(held[0]).suffix}"
+
+
 def read_model(folder: Path) -> list[ModelImage]:
     """The images of a model, by name; binary files are read where both are there.
 
