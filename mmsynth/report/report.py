@@ -35,6 +35,7 @@ _COLUMNS = {
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 3),
     "psnr_truth": ("PSNR against truth [dB]", 2),
+    "psnr_truth_moved": ("PSNR against truth, test cameras moved [dB]", 2),
     "psnr_aligned": ("PSNR aligned [dB]", 2),
     "psnr_aligned_free_gain": ("aligned, free gain [dB]", 2),
     "within_2sd": ("within 2 deviations", 3),

@@ -21,6 +21,7 @@ _COLUMNS = {
     "ssim": "ssim",
     "lpips": "lpips",
     "psnr_truth": "truth [dB]",
+    "psnr_truth_moved": "moved",
     "psnr_aligned": "aligned [dB]",
     "psnr_aligned_free_gain": "free gain",
     "within_2sd": "within 2 sd",

@@ -10,8 +10,9 @@ averaged per view in dB):
   region), and only where there is neither "opacity" (the field's own > 0.5: a field must not choose its own exam, so it says so).
 * ``psnr_foreground_view_mean``: the mean of dB over views, each view's MSE pooled over the pixels of its foreground. Papers on MMS-DATA
   give this one; where views differ it is mostly the higher of the two, as a geometric mean of errors is below the arithmetic one.
-* ``psnr_moved``, ``psnr_foreground_moved``: where the fit moved views, so are those that it did not learn from (see ``placing``), and this
-  is the PSNR at their places then; ``moved_px``: of each of these views how far off it was, pixels.
+* ``psnr_moved``, ``psnr_foreground_moved``, ``psnr_truth_moved``: where the fit moved views, so are those that it did not learn from (see
+  ``placing``), and these are ``psnr``, ``psnr_foreground`` and ``psnr_truth`` at their places then; ``moved_px``: of each of these views
+  how far off it was, pixels. All else is scored at the poses of the input.
 * ``ssim``: Wang et al. 2004, per sub-frame of one mosaic position (never on the interleaved mosaic), averaged; frames without
   mosaic per channel.
 * ``lpips``: of Zhang et al. 2018, where a network is installed, see ``perceptual``.
@@ -177,10 +178,13 @@ def _where_placed(exam: _Exam, frame: Frame, pose: np.ndarray) -> None:
     """A frame's sensor against the frame, from where it saw what it shows."""
     sensor, scores = exam.sensors[frame.sensor], exam.scores[frame.sensor]
     rendering = exam.render(frame, [sensor.name], False, pose)
-    found = _compared(sensor, frame, rendering, exam.truth.region(frame), exam.masks)
+    region, light = exam.truth.region(frame), exam.truth.image(frame)
+    found = _compared(sensor, frame, rendering, region, exam.masks)
     scores.add("psnr_moved", found.squared[found.valid])
     for source, inside in found.foreground.items():
         scores.add(f"psnr_foreground_moved/{source}", found.squared[found.valid & inside])
+    if light is not None and region is not None:
+        _score_truth(scores, "psnr_truth_moved", sensor, rendering, light, region)
 
 
 def _at_rgb_pose(exam: _Exam, frame: Frame) -> None:
@@ -384,7 +388,9 @@ def _summary(scores: Scores, own_pose: Scores) -> dict[str, Any]:
             moved = {"psnr_moved": scores.value("psnr_moved"), "psnr_foreground_moved": scores.value(f"psnr_foreground_moved/{source}")}
             out |= {key: value for key, value in moved.items() if value is not None}
             break
-    out |= _values(scores, ("ssim", "lpips", "psnr_truth", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS)))
+    out |= _values(
+        scores, ("ssim", "lpips", "psnr_truth", "psnr_truth_moved", "psnr_truth_full", "psnr_aligned", *(f"psnr_{part}" for part in PARTS))
+    )
     out |= _prediction(scores)
     light = ("sam", "stokes_rmse", "s1_s2_rmse", "s1_s2_unpolarized_rmse", "dolp_rmse", "dolp_mae", "aolp_mae")
     return out | (_values(scores, light) or _values(own_pose, light))
