@@ -1,4 +1,4 @@
-"""The training pixels, in memory as they were stored, and random batches of them as rays."""
+"""The training pixels, or as many of their rows as a fit needs, in memory as they were stored, and random batches of them as rays."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from torch import Tensor
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
 from mmsynth.fitting.directions import pixel_directions
+from mmsynth.fitting.kept_rows import kept_rows, seen_in
 from mmsynth.fitting.stored_frames import KINDS, OnLoad, in_threads, read_frames
 from mmsynth.fitting.tiles import Tile, Tiled, all_pixels, joined, selection_of, some_pixels, tile_size
 from mmsynth.scene.masks import read_mask
@@ -65,7 +66,8 @@ class Modality:
         rotations, origins: (F, 3, 3), (F, 3) float32, camera to world, normalised frame.
         digests: of each frame, a hash of its values. views: (F,) int, which it is of.
         total: how many pixels. pixels: of these, how many numbers are learned from: with a ray, and within the mask where masks are
-            ``object`` or ``ignore``. empty: with a ray outside an object's mask: nothing is there.
+            ``object`` or ``ignore``. empty: with a ray outside an object's mask: nothing is there. every: from one row that is kept to the
+            next; if it is not 1, pixels and empty are as many as they would be of all rows.
         masked: frames with a mask that is learned from. has_alpha: whether a frame has alpha.
         radiance_scale: the mean of its values, by which residuals are compared with those of other modalities.
     """
@@ -82,6 +84,7 @@ class Modality:
     empty: int
     masked: int
     has_alpha: bool
+    every: int = 1
     radiance_scale: float = math.nan
 
     @property
@@ -230,21 +233,25 @@ def measure(
     """
     order = tuple(sorted(frames, key=lambda n: frames[n][0].is_polarization))
     sensors, listed = [frames[n][0] for n in order], [frames[n][1] for n in order]
-    stored = read_frames([(sensor, frame) for sensor, of_sensor in zip(sensors, listed, strict=True) for frame in of_sensor], on_load)
-    cameras = [list(dict.fromkeys(f.camera for f in of_sensor)) for of_sensor in listed]
+    totals = [sum(f.camera.width * f.camera.height for f in of_sensor) for of_sensor in listed]
+    periods = [1 if s.mosaic is None else s.mosaic.shape[0] for s in sensors]
+    rows = [kept_rows([f.camera for f in fs], rays_to_come / len(order), period) for fs, period in zip(listed, periods, strict=True)]
+    kept = [[seen_in(f.camera, r) for f, r in zip(*pair, strict=True)] for pair in zip(listed, rows, strict=True)]
+    pairs = [(sensor, frame) for sensor, of_sensor in zip(sensors, listed, strict=True) for frame in of_sensor]
+    stored = read_frames(pairs, [r for of_sensor in rows for r in of_sensor], on_load)
+    cameras = [list(dict.fromkeys(of_sensor)) for of_sensor in kept]
     directions, has_ray = pixel_directions([c for of_sensor in cameras for c in of_sensor])
     first_frame, first_camera = _begins(map(len, listed)), _begins(map(len, cameras))
-    totals = [sum(f.camera.width * f.camera.height for f in of_sensor) for of_sensor in listed]
-    tiles = [tile_size(total, rays_to_come / len(order)) for total in totals]
+    counts = [sum(c.width * c.height for c in of_sensor) for of_sensor in kept]
+    tiles = [tile_size(count, rays_to_come / len(order)) for count in counts]
     of, camera_of, chosen, empty = {}, [], [], []
     for n, (name, sensor, of_sensor) in enumerate(zip(order, sensors, listed, strict=True)):
-        index = np.array([cameras[n].index(f.camera) for f in of_sensor])
-        camera_of.append(first_camera[n] + index)
+        camera_of.append(first_camera[n] + np.array([cameras[n].index(c) for c in kept[n]]))
         usable = [has_ray[c] for c in camera_of[n]]
         if not all(rays is None or rays.any() for rays in usable):
             raise InputError(f"{name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
         masked = 0 if masks == "off" else sum(f.mask is not None for f in of_sensor)
-        inside, outside = _inside_outside(of_sensor, usable, masks if masked else "off", tiles[n])
+        inside, outside = _inside_outside(of_sensor, rows[n], usable, masks if masked else "off", tiles[n])
         if not inside.pixels.any():
             raise InputError(
                 f"{of_sensor[0].mask}: this mask of {name} and those of all its other training frames are empty, "
@@ -254,14 +261,14 @@ def measure(
         empty.append(outside)
         poses = np.stack([f.camera_to_world for f in of_sensor])
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
-        own = slice(first_frame[n], first_frame[n + 1])
+        own, of_each = slice(first_frame[n], first_frame[n + 1]), totals[n] / counts[n]
+        lenses = list(dict.fromkeys(f.camera for f in of_sensor))
         of[name] = Modality(
-            sensor, cameras[n], index, *_rotations_origins(poses), stored.digest[own],
-            np.array([f.view for f in of_sensor]), totals[n], int(inside.pixels.sum()),
-            int(outside.pixels.sum()), masked, has_alpha=bool((stored.stride[own] > _values(sensor)).any()),
+            sensor, lenses, np.array([lenses.index(f.camera) for f in of_sensor]), *_rotations_origins(poses), stored.digest[own],
+            np.array([f.view for f in of_sensor]), totals[n], round(of_each * int(inside.pixels.sum())),
+            round(of_each * int(outside.pixels.sum())), masked, bool((stored.stride[own] > _values(sensor)).any()), rows[n][0].step,
         )  # fmt: skip
-    pairs = [(tile, f.camera) for tile, of_sensor in zip(tiles, listed, strict=True) for f in of_sensor]
-    first_tile = _begins(math.prod(tile.down_across(c.height, c.width)) for tile, c in pairs)
+    first_tile = _begins(math.prod(t.down_across(c.height, c.width)) for t, of_sensor in zip(tiles, kept, strict=True) for c in of_sensor)
     ordered = [of[n] for n in order]
     frame_table = kernels.Frames(
         torch.from_numpy(stored.start), torch.from_numpy(stored.kind), torch.from_numpy(stored.stride), _whole(np.concatenate(camera_of)),
@@ -292,16 +299,18 @@ def fingerprint(measurements: Measurements) -> str:
     return digest.hexdigest()[:16]
 
 
-def _inside_outside(frames: Sequence[Frame], usable: Sequence[np.ndarray | None], masks: MaskMeaning, tile: Tile) -> tuple[Tiled, Tiled]:
+def _inside_outside(
+    frames: Sequence[Frame], rows: Sequence[slice], usable: Sequence[np.ndarray | None], masks: MaskMeaning, tile: Tile
+) -> tuple[Tiled, Tiled]:
     """The pixels of a modality that are learned from, and those where nothing is.
 
     A frame without a mask beside frames with one: to ignore nothing is to learn from all of it; but what in it is not the object,
     nobody knows, and nothing is learned from it.
 
     Args:
-        usable: of each frame (H, W) bool, which pixels have a ray, None = all.
+        rows: of each frame, which are kept. usable: of these, (H, W) bool, which pixels have a ray, None = all.
     """
-    shapes = [(f.camera.height, f.camera.width) for f in frames]
+    shapes = [(len(range(f.camera.height)[r]), f.camera.width) for f, r in zip(frames, rows, strict=True)]
     none = all_pixels(shapes, tile)
     none = none._replace(pixels=np.zeros_like(none.pixels))
     if masks == "off" and all(rays is None for rays in usable):
@@ -310,10 +319,11 @@ def _inside_outside(frames: Sequence[Frame], usable: Sequence[np.ndarray | None]
     def of_frame(i: int) -> tuple[Tiled, Tiled | None]:
         has_ray = usable[i]
         rays = np.ones(shapes[i], bool) if has_ray is None else has_ray
-        mask = None if masks == "off" else read_mask(frames[i])
-        if mask is None:
+        whole = None if masks == "off" else read_mask(frames[i])
+        if whole is None:
             learned = rays if masks != "object" else np.zeros_like(rays)
             return some_pixels(learned, tile), some_pixels(np.zeros_like(rays), tile) if masks == "object" else None
+        mask = whole[rows[i]]
         return some_pixels(rays & mask, tile), some_pixels(rays & ~mask, tile) if masks == "object" else None
 
     inside, outside = zip(*in_threads(of_frame, len(frames)), strict=True)

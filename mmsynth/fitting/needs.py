@@ -252,6 +252,9 @@ def _resolution(f: _Facts, background: bool) -> Choice[Resolution]:
     radiance = int(np.clip(2 * extent * f.recipe.radiance.cells_per_pixel / footprint, 64, 2048))
     cells = f"finest cells {2 / across:.2g} (surface), {2 / radiance:.2g} (radiance)"
     seen = f", {coarser:.1f} pixels apart for {f.rays_to_come:.1e} rays on {f.pixels:.1e} pixels" if coarser > 1 else ""
+    every = {n: m.every for n, m in f.measurements.items() if m.every > 1}
+    kept = (f"one in {k} of {', '.join(n for n in every if every[n] == k)}" for k in sorted(set(every.values())))
+    seen += f" (rows kept: {'; '.join(kept)})" if every else ""
     few = f", the surface's for {surface.measurements_per_cell:g} measurements of each" if seen_enough < finest else ""
     why = f"a pixel is {f.footprint:.2g} radii at the centre{seen}: {cells}{few}"
     return Choice(Resolution(across, radiance, min(1.0, seen_enough / finest)), why, bool(seen or few))

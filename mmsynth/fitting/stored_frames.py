@@ -38,17 +38,20 @@ class StoredFrames(NamedTuple):
     digest: list[bytes]
 
 
-def read_frames(frames: Sequence[tuple[Sensor, Frame]], on_load: OnLoad | None = None) -> StoredFrames:
+def read_frames(frames: Sequence[tuple[Sensor, Frame]], rows: Sequence[slice] | None = None, on_load: OnLoad | None = None) -> StoredFrames:
     """Read the frames of several sensors, some at a time.
 
     Room is made once, by the first frame of each sensor; frames that are stored in a wider way than that stand behind the others.
 
+    Args:
+        rows: which of each frame are kept; None: all. Digests are of all.
     Raises:
         InputError: as ``scene.images.load_frame``, for the first such frame; there is not enough memory for them.
     """
     firsts = {sensor.name: i for i, (sensor, _) in reversed(list(enumerate(frames)))}
     patterns = {name: _compact(stored_frame(*frames[i])) for name, i in firsts.items()}
-    sizes = [_room(frame, patterns[sensor.name]) for sensor, frame in frames]
+    kept = [slice(None)] * len(frames) if rows is None else rows
+    sizes = [_room(frame, part, patterns[sensor.name]) for (sensor, frame), part in zip(frames, kept, strict=True)]
     begins = np.cumsum([0, *sizes])
     data = _reserved(int(begins[-1]), [frame for _, frame in frames])
     start, kind, stride = np.zeros(len(frames), np.int64), np.zeros(len(frames), np.int32), np.zeros(len(frames), np.int32)
@@ -57,9 +60,9 @@ def read_frames(frames: Sequence[tuple[Sensor, Frame]], on_load: OnLoad | None =
 
     def read(i: int) -> None:
         stored = _compact(stored_frame(*frames[i]))
-        flat = np.ascontiguousarray(stored).reshape(-1).view(np.uint8)
         kind[i], stride[i] = KINDS.index(stored.dtype), stored.shape[2]
-        digest[i] = hashlib.sha256(flat.data).digest()
+        digest[i] = hashlib.sha256(np.ascontiguousarray(stored).data).digest()
+        flat = np.ascontiguousarray(stored[kept[i]]).reshape(-1).view(np.uint8)
         if len(flat) <= sizes[i]:
             data[begins[i] : begins[i] + len(flat)] = flat
             start[i] = begins[i] // stored.dtype.itemsize
@@ -88,9 +91,9 @@ def in_threads(work: Callable[[int], T], count: int, on_load: OnLoad | None = No
     return out
 
 
-def _room(frame: Frame, like: np.ndarray) -> int:
-    """Bytes of a frame that is stored as another one of its sensor."""
-    size = frame.camera.width * frame.camera.height * like.shape[2] * like.dtype.itemsize
+def _room(frame: Frame, rows: slice, like: np.ndarray) -> int:
+    """Bytes of these rows of a frame that is stored as another one of its sensor."""
+    size = frame.camera.width * len(range(frame.camera.height)[rows]) * like.shape[2] * like.dtype.itemsize
     return size + -size % _ALIGNED
 
 

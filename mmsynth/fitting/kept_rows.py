@@ -1,0 +1,37 @@
+"""Of frames with far more pixels than a fit will draw, every so many rows are kept: a frame of every k-th row is one of another camera.
+
+A fit of a minute draws some four million rays, a rig of full size records hundreds of millions of pixels: held in memory, nearly all of
+them would be there for nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mmsynth.sensors.camera import Camera
+
+_CLOSER = 2.0  # kept rows stand closer together than rays do, by so much
+_FEWEST = 64  # rows that are kept of a frame, at the least
+
+
+def kept_rows(cameras: Sequence[Camera], rays_to_come: float, period: int) -> list[slice]:
+    """Which rows of each frame of a modality are kept.
+
+    From one to the next it is k rows, so that a frame of them has the mosaic of the whole, and k no more than half of what would be
+    between rays that a fit spreads evenly over all pixels. Frames take turns in where they begin: what one leaves out others show.
+
+    Args:
+        cameras: of the frames. rays_to_come: of this modality. period: rows after which its mosaic repeats.
+    """
+    apart = math.sqrt(sum(c.width * c.height for c in cameras) / rays_to_come)
+    most = min(apart / _CLOSER, min(c.height for c in cameras) / (_FEWEST * period))
+    step = 1 + period * max(0, math.floor((most - 1) / period))
+    return [slice(period * (i % step), None, step) for i in range(len(cameras))]
+
+
+def seen_in(camera: Camera, rows: slice) -> Camera:
+    """The camera of such rows of its frames."""
+    step, height = rows.step, len(range(camera.height)[rows])
+    return camera if step == 1 else replace(camera, height=height, fy=camera.fy / step, cy=(camera.cy - rows.start) / step)
