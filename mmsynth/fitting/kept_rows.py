@@ -1,7 +1,7 @@
-"""Of frames with far more pixels than a fit will draw, every so many rows are kept: a frame of every k-th row is one of another camera.
+"""Of large frames with far more pixels than a fit draws, every so many rows are kept: a frame of every k-th row is one of another camera.
 
-A fit of a minute draws some four million rays, a rig of full size records hundreds of millions of pixels: held in memory, nearly all of
-them would be there for nothing.
+A fit of a minute draws some four million rays, photographs of a scene can have billions of pixels: in memory nearly all of them would be
+for nothing.
 """
 
 from __future__ import annotations
@@ -10,10 +10,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
 
+_HELD = 1 << 29  # numbers of all frames together, which are held anyway: one or two bytes each
 _CLOSER = 2.0  # kept rows stand closer together than rays do, by so much
 _FEWEST = 64  # rows that are kept of a frame, at the least
+
+
+def rows_of(frames: Sequence[tuple[Sensor, Sequence[Frame]]], rays_to_come: float) -> list[list[slice]]:
+    """Which rows of each frame of several modalities are kept, of a fit that will draw so many rays of all."""
+    size = lambda frame: frame.camera.width * frame.camera.height
+    numbers = sum(size(f) * (s.channel_count if s.mosaic is None else 1) for s, listed in frames for f in listed)
+    rays = math.inf if numbers <= _HELD else rays_to_come / len(frames)
+    return [kept_rows([f.camera for f in listed], rays, 1 if s.mosaic is None else s.mosaic.shape[0]) for s, listed in frames]
 
 
 def kept_rows(cameras: Sequence[Camera], rays_to_come: float, period: int) -> list[slice]:

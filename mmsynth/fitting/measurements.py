@@ -16,7 +16,7 @@ from torch import Tensor
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
 from mmsynth.fitting.directions import pixel_directions
-from mmsynth.fitting.kept_rows import kept_rows, seen_in
+from mmsynth.fitting.kept_rows import rows_of, seen_in
 from mmsynth.fitting.stored_frames import KINDS, OnLoad, in_threads, read_frames
 from mmsynth.fitting.tiles import Tile, Tiled, all_pixels, joined, selection_of, some_pixels, tile_size
 from mmsynth.scene.masks import read_mask
@@ -234,8 +234,7 @@ def measure(
     order = tuple(sorted(frames, key=lambda n: frames[n][0].is_polarization))
     sensors, listed = [frames[n][0] for n in order], [frames[n][1] for n in order]
     totals = [sum(f.camera.width * f.camera.height for f in of_sensor) for of_sensor in listed]
-    periods = [1 if s.mosaic is None else s.mosaic.shape[0] for s in sensors]
-    rows = [kept_rows([f.camera for f in fs], rays_to_come / len(order), period) for fs, period in zip(listed, periods, strict=True)]
+    rows = rows_of([frames[n] for n in order], rays_to_come)
     kept = [[seen_in(f.camera, r) for f, r in zip(*pair, strict=True)] for pair in zip(listed, rows, strict=True)]
     pairs = [(sensor, frame) for sensor, of_sensor in zip(sensors, listed, strict=True) for frame in of_sensor]
     stored = read_frames(pairs, [r for of_sensor in rows for r in of_sensor], on_load)

@@ -14,7 +14,7 @@ from conftest import ring
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mmsynth.fitting.kept_rows import kept_rows, seen_in
+from mmsynth.fitting.kept_rows import kept_rows, rows_of, seen_in
 from mmsynth.fitting.measurements import Measurements, draw, fingerprint, measure
 from mmsynth.fitting.recipe import load_recipe
 from mmsynth.fitting.trainer import Trainer
@@ -26,6 +26,11 @@ REGION = Region((0.0, 0.0, 0.0), 1.0)
 CAMERA = Camera(24, 420, 250.0, 260.0, 11.5, 208.0, (-0.08, 0.02, 0.001, -0.002))
 BAYER = Sensor("rgb", ("R", "G", "B"), (None,) * 3, mosaic=np.array([[0, 1], [1, 2]]))
 FISHEYE = Camera(24, 420, 120.0, 118.0, 11.0, 212.0, (0.02, -0.01, 0.003, 0.0), "kannala_brandt")
+
+
+@pytest.fixture(autouse=True)
+def _all_frames_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mmsynth.fitting.kept_rows._HELD", 0)
 
 
 @given(st.lists(st.integers(1, 4000), min_size=1, max_size=20), st.integers(1, 3000), st.floats(1.0, 1e12), st.integers(1, 5))
@@ -49,6 +54,14 @@ def test_frames_take_turns_until_every_row_is_kept() -> None:
 def test_a_fit_that_draws_as_many_rays_keeps_all_rows() -> None:
     assert kept_rows([CAMERA] * 4, 4 * 420 * 24, 1) == [slice(0, None, 1)] * 4 == kept_rows([CAMERA] * 4, math.inf, 1)
     assert seen_in(CAMERA, slice(0, None, 1)) is CAMERA
+
+
+def test_frames_that_are_not_large_are_kept_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [(BAYER, [Frame("rgb", i, Path("none"), CAMERA, np.eye(4)) for i in range(4)])]
+    monkeypatch.setattr("mmsynth.fitting.kept_rows._HELD", 4 * 420 * 24 - 1)
+    assert rows_of(frames, 100.0)[0][1] == slice(2, None, 3)
+    monkeypatch.setattr("mmsynth.fitting.kept_rows._HELD", 4 * 420 * 24)
+    assert rows_of(frames, 100.0) == [[slice(0, None, 1)] * 4]
 
 
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE, dataclasses.replace(CAMERA, distortion=())])
