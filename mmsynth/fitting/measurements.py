@@ -201,7 +201,7 @@ def load_measurements(
     """Training pixels of all modalities.
 
     Args:
-        rays_to_come: how many a fit will draw, about: the size of tiles follows from it. on_load: news of what was read.
+        rays_to_come: how many a fit will draw, about: by it are tiles, and rows that are kept. on_load: news of what was read.
     Raises:
         InputError: as ``measure``; there is no training frame; a modality has no light in any of them.
     """
