@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from mmsynth.scene.scene import Frame, Sensor
 from mmsynth.sensors.camera import Camera
@@ -18,12 +18,24 @@ _CLOSER = 2.0  # kept rows stand closer together than rays do, by so much
 _FEWEST = 64  # rows that are kept of a frame, at the least
 
 
-def rows_of(frames: Sequence[tuple[Sensor, Sequence[Frame]]], rays_to_come: float) -> list[list[slice]]:
-    """Which rows of each frame of several modalities are kept, of a fit that will draw so many rays of all."""
-    size = lambda frame: frame.camera.width * frame.camera.height
-    numbers = sum(size(f) * (s.channel_count if s.mosaic is None else 1) for s, listed in frames for f in listed)
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of a frame: ``rows``, and ``camera``, that of the frame which they are."""
+
+    rows: slice
+    camera: Camera
+
+
+def kept_of(frames: Sequence[tuple[Sensor, Sequence[Frame]]], rays_to_come: float) -> list[list[Kept]]:
+    """What is kept of each frame of several modalities, of a fit that will draw so many rays of all."""
+    numbers = sum(s.values_per_pixel * f.camera.width * f.camera.height for s, listed in frames for f in listed)
     rays = math.inf if numbers <= _HELD else rays_to_come / len(frames)
-    return [kept_rows([f.camera for f in listed], rays, 1 if s.mosaic is None else s.mosaic.shape[0]) for s, listed in frames]
+    out = []
+    for sensor, listed in frames:
+        cameras = [f.camera for f in listed]
+        rows = kept_rows(cameras, rays, 1 if sensor.mosaic is None else sensor.mosaic.shape[0])
+        out.append([Kept(r, seen_in(c, r)) for r, c in zip(rows, cameras, strict=True)])
+    return out
 
 
 def kept_rows(cameras: Sequence[Camera], rays_to_come: float, period: int) -> list[slice]:

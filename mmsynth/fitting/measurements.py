@@ -16,7 +16,7 @@ from torch import Tensor
 from mmsynth.errors import InputError
 from mmsynth.field import kernels
 from mmsynth.fitting.directions import pixel_directions
-from mmsynth.fitting.kept_rows import rows_of, seen_in
+from mmsynth.fitting.kept_rows import Kept, kept_of
 from mmsynth.fitting.stored_frames import KINDS, OnLoad, in_threads, read_frames
 from mmsynth.fitting.tiles import Tile, Tiled, all_pixels, joined, selection_of, some_pixels, tile_size
 from mmsynth.scene.masks import read_mask
@@ -90,7 +90,7 @@ class Modality:
     @property
     def values(self) -> int:
         """Numbers that are measured along a ray."""
-        return _values(self.sensor)
+        return self.sensor.values_per_pixel
 
     @property
     def has_opacity(self) -> bool:
@@ -234,23 +234,22 @@ def measure(
     order = tuple(sorted(frames, key=lambda n: frames[n][0].is_polarization))
     sensors, listed = [frames[n][0] for n in order], [frames[n][1] for n in order]
     totals = [sum(f.camera.width * f.camera.height for f in of_sensor) for of_sensor in listed]
-    rows = rows_of([frames[n] for n in order], rays_to_come)
-    kept = [[seen_in(f.camera, r) for f, r in zip(*pair, strict=True)] for pair in zip(listed, rows, strict=True)]
+    kept = kept_of([frames[n] for n in order], rays_to_come)
     pairs = [(sensor, frame) for sensor, of_sensor in zip(sensors, listed, strict=True) for frame in of_sensor]
-    stored = read_frames(pairs, [r for of_sensor in rows for r in of_sensor], on_load)
-    cameras = [list(dict.fromkeys(of_sensor)) for of_sensor in kept]
+    stored = read_frames(pairs, [k for of_sensor in kept for k in of_sensor], on_load)
+    cameras = [list(dict.fromkeys(k.camera for k in of_sensor)) for of_sensor in kept]
     directions, has_ray = pixel_directions([c for of_sensor in cameras for c in of_sensor])
     first_frame, first_camera = _begins(map(len, listed)), _begins(map(len, cameras))
-    counts = [sum(c.width * c.height for c in of_sensor) for of_sensor in kept]
+    counts = [sum(k.camera.width * k.camera.height for k in of_sensor) for of_sensor in kept]
     tiles = [tile_size(count, rays_to_come / len(order)) for count in counts]
     of, camera_of, chosen, empty = {}, [], [], []
     for n, (name, sensor, of_sensor) in enumerate(zip(order, sensors, listed, strict=True)):
-        camera_of.append(first_camera[n] + np.array([cameras[n].index(c) for c in kept[n]]))
+        camera_of.append(first_camera[n] + np.array([cameras[n].index(k.camera) for k in kept[n]]))
         usable = [has_ray[c] for c in camera_of[n]]
         if not all(rays is None or rays.any() for rays in usable):
             raise InputError(f"{name}: the lens model has no valid ray for any pixel; check its distortion coefficients.")
         masked = 0 if masks == "off" else sum(f.mask is not None for f in of_sensor)
-        inside, outside = _inside_outside(of_sensor, rows[n], usable, masks if masked else "off", tiles[n])
+        inside, outside = _inside_outside(of_sensor, kept[n], usable, masks if masked else "off", tiles[n])
         if not inside.pixels.any():
             raise InputError(
                 f"{of_sensor[0].mask}: this mask of {name} and those of all its other training frames are empty, "
@@ -262,12 +261,14 @@ def measure(
         poses[:, :3, 3] = (poses[:, :3, 3] - np.array(region.centre)) / region.radius
         own, of_each = slice(first_frame[n], first_frame[n + 1]), totals[n] / counts[n]
         lenses = list(dict.fromkeys(f.camera for f in of_sensor))
+        has_alpha = bool((stored.stride[own] > sensor.values_per_pixel).any())
         of[name] = Modality(
             sensor, lenses, np.array([lenses.index(f.camera) for f in of_sensor]), *_rotations_origins(poses), stored.digest[own],
             np.array([f.view for f in of_sensor]), totals[n], round(of_each * int(inside.pixels.sum())),
-            round(of_each * int(outside.pixels.sum())), masked, bool((stored.stride[own] > _values(sensor)).any()), rows[n][0].step,
+            round(of_each * int(outside.pixels.sum())), masked, has_alpha, kept[n][0].rows.step,
         )  # fmt: skip
-    first_tile = _begins(math.prod(t.down_across(c.height, c.width)) for t, of_sensor in zip(tiles, kept, strict=True) for c in of_sensor)
+    tiled = [(tile, k.camera) for tile, of_sensor in zip(tiles, kept, strict=True) for k in of_sensor]
+    first_tile = _begins(math.prod(tile.down_across(c.height, c.width)) for tile, c in tiled)
     ordered = [of[n] for n in order]
     frame_table = kernels.Frames(
         torch.from_numpy(stored.start), torch.from_numpy(stored.kind), torch.from_numpy(stored.stride), _whole(np.concatenate(camera_of)),
@@ -299,7 +300,7 @@ def fingerprint(measurements: Measurements) -> str:
 
 
 def _inside_outside(
-    frames: Sequence[Frame], rows: Sequence[slice], usable: Sequence[np.ndarray | None], masks: MaskMeaning, tile: Tile
+    frames: Sequence[Frame], kept: Sequence[Kept], usable: Sequence[np.ndarray | None], masks: MaskMeaning, tile: Tile
 ) -> tuple[Tiled, Tiled]:
     """The pixels of a modality that are learned from, and those where nothing is.
 
@@ -307,9 +308,9 @@ def _inside_outside(
     nobody knows, and nothing is learned from it.
 
     Args:
-        rows: of each frame, which are kept. usable: of these, (H, W) bool, which pixels have a ray, None = all.
+        kept: what of each frame. usable: of that (H, W) bool, which pixels have a ray, None = all.
     """
-    shapes = [(len(range(f.camera.height)[r]), f.camera.width) for f, r in zip(frames, rows, strict=True)]
+    shapes = [(k.camera.height, k.camera.width) for k in kept]
     none = all_pixels(shapes, tile)
     none = none._replace(pixels=np.zeros_like(none.pixels))
     if masks == "off" and all(rays is None for rays in usable):
@@ -322,7 +323,7 @@ def _inside_outside(
         if whole is None:
             learned = rays if masks != "object" else np.zeros_like(rays)
             return some_pixels(learned, tile), some_pixels(np.zeros_like(rays), tile) if masks == "object" else None
-        mask = whole[rows[i]]
+        mask = whole[kept[i].rows]
         return some_pixels(rays & mask, tile), some_pixels(rays & ~mask, tile) if masks == "object" else None
 
     inside, outside = zip(*in_threads(of_frame, len(frames)), strict=True)
@@ -383,11 +384,6 @@ def _moved(table: Table, device: torch.device | str) -> Table:
 def _rotations_origins(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(F, 4, 4) → (F, 3, 3), (F, 3) float32."""
     return poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
-
-
-def _values(sensor: Sensor) -> int:
-    """Numbers that are measured along a ray."""
-    return 1 if sensor.mosaic is not None else sensor.channel_count
 
 
 def _whole(values: Sequence[int] | np.ndarray) -> Tensor:

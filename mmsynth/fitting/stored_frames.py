@@ -11,8 +11,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from mmsynth.errors import InputError
+from mmsynth.fitting.kept_rows import Kept
 from mmsynth.scene.images import decode, stored_frame
 from mmsynth.scene.scene import Frame, Sensor
+from mmsynth.sensors.camera import Camera
 from mmsynth.threads import usable_cores
 
 T = TypeVar("T")
@@ -38,20 +40,20 @@ class StoredFrames(NamedTuple):
     digest: list[bytes]
 
 
-def read_frames(frames: Sequence[tuple[Sensor, Frame]], rows: Sequence[slice] | None = None, on_load: OnLoad | None = None) -> StoredFrames:
+def read_frames(frames: Sequence[tuple[Sensor, Frame]], kept: Sequence[Kept] | None = None, on_load: OnLoad | None = None) -> StoredFrames:
     """Read the frames of several sensors, some at a time.
 
     Room is made once, by the first frame of each sensor; frames that are stored in a wider way than that stand behind the others.
 
     Args:
-        rows: which of each frame are kept; None: all. Digests are of all.
+        kept: what of each frame; None: all. Digests are of all.
     Raises:
         InputError: as ``scene.images.load_frame``, for the first such frame; there is not enough memory for them.
     """
     firsts = {sensor.name: i for i, (sensor, _) in reversed(list(enumerate(frames)))}
     patterns = {name: _compact(stored_frame(*frames[i])) for name, i in firsts.items()}
-    kept = [slice(None)] * len(frames) if rows is None else rows
-    sizes = [_room(frame, part, patterns[sensor.name]) for (sensor, frame), part in zip(frames, kept, strict=True)]
+    held = [Kept(slice(None), frame.camera) for _, frame in frames] if kept is None else kept
+    sizes = [_room(part.camera, patterns[sensor.name]) for (sensor, _), part in zip(frames, held, strict=True)]
     begins = np.cumsum([0, *sizes])
     data = _reserved(int(begins[-1]), [frame for _, frame in frames])
     start, kind, stride = np.zeros(len(frames), np.int64), np.zeros(len(frames), np.int32), np.zeros(len(frames), np.int32)
@@ -59,10 +61,10 @@ def read_frames(frames: Sequence[tuple[Sensor, Frame]], rows: Sequence[slice] | 
     wider: dict[int, np.ndarray] = {}
 
     def read(i: int) -> None:
-        stored = _compact(stored_frame(*frames[i]))
+        stored = np.ascontiguousarray(_compact(stored_frame(*frames[i])))
         kind[i], stride[i] = KINDS.index(stored.dtype), stored.shape[2]
-        digest[i] = hashlib.sha256(np.ascontiguousarray(stored).data).digest()
-        flat = np.ascontiguousarray(stored[kept[i]]).reshape(-1).view(np.uint8)
+        digest[i] = hashlib.sha256(stored.data).digest()
+        flat = np.ascontiguousarray(stored[held[i].rows]).reshape(-1).view(np.uint8)
         if len(flat) <= sizes[i]:
             data[begins[i] : begins[i] + len(flat)] = flat
             start[i] = begins[i] // stored.dtype.itemsize
@@ -91,9 +93,9 @@ def in_threads(work: Callable[[int], T], count: int, on_load: OnLoad | None = No
     return out
 
 
-def _room(frame: Frame, rows: slice, like: np.ndarray) -> int:
-    """Bytes of these rows of a frame that is stored as another one of its sensor."""
-    size = frame.camera.width * len(range(frame.camera.height)[rows]) * like.shape[2] * like.dtype.itemsize
+def _room(camera: Camera, like: np.ndarray) -> int:
+    """Bytes of a frame of this camera that is stored as another one of its sensor."""
+    size = camera.width * camera.height * like.shape[2] * like.dtype.itemsize
     return size + -size % _ALIGNED
 
 

@@ -163,7 +163,7 @@ def stored_frame(sensor: Sensor, frame: Frame) -> np.ndarray:
     if sensor.mosaic is not None and image.ndim != 2:
         raise InputError(f"{frame.path}: {image.shape[2]} channels, expected one: the frames of '{sensor.name}' are mosaicked.")
     image = image[..., None] if image.ndim == 2 else image
-    count = 1 if sensor.mosaic is not None else sensor.channel_count
+    count = sensor.values_per_pixel
     if image.shape[2] == count or (count in (1, 3) and image.shape[2] == count + 1):
         return image
     if count == 1 and image.shape[2] in (3, 4) and is_grey(image):

@@ -66,6 +66,11 @@ class Sensor:
         return len(self.channels)
 
     @property
+    def values_per_pixel(self) -> int:
+        """Numbers that a frame has of each pixel: one under a mosaic, else one for each channel."""
+        return self.channel_count if self.mosaic is None else 1
+
+    @property
     def is_polarization(self) -> bool:
         return self.polarizer_angles_deg is not None
 

@@ -14,7 +14,7 @@ from conftest import ring
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mmsynth.fitting.kept_rows import kept_rows, rows_of, seen_in
+from mmsynth.fitting.kept_rows import kept_of, kept_rows, seen_in
 from mmsynth.fitting.measurements import Measurements, draw, fingerprint, measure
 from mmsynth.fitting.recipe import load_recipe
 from mmsynth.fitting.trainer import Trainer
@@ -59,9 +59,9 @@ def test_a_fit_that_draws_as_many_rays_keeps_all_rows() -> None:
 def test_frames_that_are_not_large_are_kept_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [(BAYER, [Frame("rgb", i, Path("none"), CAMERA, np.eye(4)) for i in range(4)])]
     monkeypatch.setattr("mmsynth.fitting.kept_rows._HELD", 4 * 420 * 24 - 1)
-    assert rows_of(frames, 100.0)[0][1] == slice(2, None, 3)
+    assert kept_of(frames, 100.0)[0][1].rows == slice(2, None, 3)
     monkeypatch.setattr("mmsynth.fitting.kept_rows._HELD", 4 * 420 * 24)
-    assert rows_of(frames, 100.0) == [[slice(0, None, 1)] * 4]
+    assert [k.rows for k in kept_of(frames, 100.0)[0]] == [slice(0, None, 1)] * 4 and kept_of(frames, 100.0)[0][1].camera is CAMERA
 
 
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE, dataclasses.replace(CAMERA, distortion=())])
